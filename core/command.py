@@ -1,0 +1,162 @@
+"""The command line: `blender -b --command material_palette extract PHOTO... -o DIR`, and the same outside Blender."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from .dependencies import install_command, missing
+from .errors import PaletteError
+
+DONE, BAD_INPUT, SOME_FAILED, INTERRUPTED = 0, 2, 3, 130
+
+
+def main(argv: list[str]) -> int:
+    """Run one command; returns the exit code.
+
+    0: all materials were made. 2: bad input, said on standard error, nothing written for that photo. 3: some regions
+    failed, the others were written. 130: interrupted, nothing written for that photo.
+    """
+    parser = _parser()
+    try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as end:  # argparse has said why
+        return int(end.code or 0)
+    lacking = missing()
+    if lacking:
+        for entry in lacking:
+            print(f"{entry.package} is missing: it {entry.reason}", file=sys.stderr)
+        print(f"Install it with:\n  {install_command(lacking)}", file=sys.stderr)
+        return BAD_INPUT
+    codes = [0]
+    try:
+        for photo, masks, folder in _jobs(arguments):
+            try:
+                codes.append(_extract(photo, masks, folder, arguments))
+            except PaletteError as error:
+                _complain(error)
+                codes.append(BAD_INPUT)
+    except PaletteError as error:
+        _complain(error)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("interrupted; nothing was written for this photo", file=sys.stderr)
+        return INTERRUPTED
+    return BAD_INPUT if BAD_INPUT in codes else max(codes)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("material_palette", description="Tileable PBR materials from a photo's regions.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="extract")
+    extract = commands.add_parser("extract", help="make a palette of each photo")
+    extract.add_argument("photos", nargs="+", type=Path, metavar="PHOTO", help="image file; several make a folder each")
+    where = extract.add_mutually_exclusive_group(required=True)
+    where.add_argument(
+        "--masks",
+        type=Path,
+        metavar="DIR",
+        help="one mask image per material, named as the material; for several photos DIR/<photo's name>/",
+    )
+    where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto")
+    extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
+    extract.add_argument("--engine", default="patch", help="texture engine: patch")
+    extract.add_argument("--quality", default="balanced", help="draft, balanced or best (%(default)s)")
+    extract.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
+    extract.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
+    extract.add_argument("--metres-per-tile", type=float, default=1.0, metavar="M", help="size of a repeat (1)")
+    extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
+    extract.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
+    extract.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
+    extract.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
+    return parser
+
+
+def _jobs(arguments: argparse.Namespace) -> list[tuple[Path, Path | None, Path]]:
+    """(photo, folder of its masks, output folder) per photo."""
+    photos = arguments.photos
+    if len(photos) == 1:
+        return [(photos[0], arguments.masks, arguments.output)]
+    stems = [photo.stem for photo in photos]
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice:
+        raise PaletteError(f"two photos are named '{twice}' and would share an output folder; extract them separately")
+    return [(p, arguments.masks and arguments.masks / p.stem, arguments.output / p.stem) for p in photos]
+
+
+def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argparse.Namespace) -> int:
+    from . import nodes
+    from .image import read_photo
+    from .output import staged
+    from .palette import Material, Settings, extract_palette, write_palette
+    from .region import read_regions
+
+    settings = Settings(
+        engine=arguments.engine,
+        quality=arguments.quality,
+        resolution=arguments.resolution,
+        seed=arguments.seed,
+        flatten=not arguments.no_flatten,
+        metres_per_tile=arguments.metres_per_tile,
+    )
+    settings.check()
+    line = _Line(photo_path.name)
+    with staged(folder, arguments.overwrite) as staging:
+        start = time.perf_counter()
+        photo = read_photo(photo_path)
+        for warning in photo.warnings:
+            line.say(f"warning: {warning}")
+        seconds = {"photo": time.perf_counter() - start}
+        start = time.perf_counter()
+        if masks is not None:
+            regions = read_regions(masks, photo.pixels.shape[:2])
+        else:
+            from .segmentation import segment
+
+            regions = segment(photo.pixels, arguments.segment, arguments.regions, settings.seed, line.progress)
+        seconds["regions"] = time.perf_counter() - start
+
+        def on_material(material: Material) -> None:
+            if material.error:
+                line.say(f"{material.name}: FAILED: {material.error}")
+            else:
+                line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
+                for warning in material.warnings:
+                    line.say(f"{material.name}: warning: {warning}")
+
+        palette = extract_palette(photo.pixels, regions, settings, line.progress, on_material, photo_path.name)
+        palette.warnings[:0] = photo.warnings
+        palette.seconds = seconds | palette.seconds
+        failed = [material for material in palette.materials if material.error]
+        if len(failed) == len(regions):
+            raise PaletteError("no material could be made: " + "; ".join(material.error for material in failed))
+        content = write_palette(palette, staging, line.progress)
+        previews = {material.name: material.preview for material in palette.materials if not material.error}
+        nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
+    line.say(f"{len(regions) - len(failed)} of {len(regions)} materials written to {folder}")
+    return SOME_FAILED if failed else DONE
+
+
+class _Line:
+    """Progress of one photo: a line that is rewritten on a terminal, nothing but results in a log."""
+
+    def __init__(self, name: str):
+        self._name, self._shown, self._start = name, 0.0, time.monotonic()
+        self._terminal = sys.stderr.isatty()
+
+    def progress(self, fraction: float, message: str) -> None:
+        now = time.monotonic()
+        if not self._terminal or now - self._shown < 0.2:
+            return
+        self._shown = now
+        elapsed = now - self._start
+        left = f"{elapsed * (1 - fraction) / fraction:.0f} s left" if fraction > 0.03 else ""
+        print(f"\r{self._name} {fraction:4.0%} {left:11} {message[:60]:60}", end="", file=sys.stderr, flush=True)
+
+    def say(self, text: str) -> None:
+        if self._terminal:
+            print("\r" + " " * 110 + "\r", end="", file=sys.stderr, flush=True)
+        print(f"{self._name}: {text}", flush=True)
+
+
+def _complain(error: PaletteError) -> None:
+    print(f"error: {error}", file=sys.stderr)

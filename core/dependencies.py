@@ -1,0 +1,47 @@
+"""Which Python packages this interpreter lacks, why they are needed, and how to get them; imports none of them."""
+
+import importlib.metadata
+import importlib.util
+import sys
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A package that is not there: `module` as imported, `package` as installed, `reason` it is needed for."""
+
+    module: str
+    package: str
+    reason: str
+
+
+REQUIRED = (
+    Missing("numpy", "numpy", "holds every image"),
+    Missing("OpenImageIO", "OpenImageIO", "reads photos and masks, writes textures"),
+    Missing("cv2", "opencv-contrib-python-headless", "finds regions and filters images"),
+    Missing("torch", "torch", "synthesises the textures"),
+)
+
+
+def missing():
+    """Return the list of `Missing` that this interpreter can't find, in the order of `REQUIRED`."""
+    return [entry for entry in REQUIRED if not _found(entry.module)]
+
+
+def install_command(entries, python=None):
+    """Return the one-line shell command that installs `entries` (list of Missing) for this interpreter.
+
+    numpy is pinned to the version at hand: Blender's own modules are compiled against it.
+    """
+    packages = [entry.package for entry in entries]
+    if "numpy" not in packages:
+        packages.append(f"numpy=={importlib.metadata.version('numpy')}")
+    return f'"{python or sys.executable}" -m pip install {" ".join(packages)}'
+
+
+def _found(module):
+    # find_spec raises ValueError for a module that stands in sys.modules without a spec, as a stub does
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False

@@ -1,0 +1,315 @@
+"""Engine `patch`: toroidal texture synthesis from a region of any shape, without training.
+
+Claim: a map of source coordinates, quilted from large blocks at a coarse scale and refined towards the fine one, makes
+a sharp, seamless tile that keeps the structure of the region and uses all of it. Every pixel p of the texture holds the
+coordinate c(p) of an exemplar pixel. Per level, from coarse to fine, a few rounds of
+
+    S(p)  = weighted mean over offsets d of E(c(p + d) - d)                        (vote)
+    c(p) <- argmin over candidates q of |F_S(p) - F_E(q)|^2 + lambda o(q)          (search)
+
+F are the principal components of the patch around a pixel, o says how often a source is already used. Candidates are
+the continuations of the neighbours' sources (coherence) and random jumps of falling reach. All indices wrap, so the
+texture tiles by construction; c carries any channel of the exemplar along.
+
+Sources: Efros and Freeman 2001 (quilting), Kwatra et al. 2005 (texture optimisation), Lefebvre and Hoppe 2005
+(coordinates, coherence, PCA), Barnes et al. 2009 (PatchMatch), Kaspar et al. 2015 (occurrence).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ..errors import PaletteError
+
+Progress = Callable[[float, str], None]
+
+PATCH = 7
+RADIUS = PATCH // 2
+COMPONENTS = 24
+COARSEST = 48  # px: side of the square with the region's area at the coarsest level, large enough for blocks
+ANCHORS = 768  # positions tried for a quilting block
+BLOCK = 0.45  # side of a quilting block, in sides of that square
+OCCURRENCE = 0.5  # lambda, in median patch distances
+REACHES = (64, 8, 1)  # px of the random jumps
+BAND = 1 << 18  # pixels searched at a time: bounds the memory and the time to cancel
+
+ROUNDS = {"draft": (2, 1), "balanced": (6, 2), "best": (10, 4)}  # per coarse level, at the finest level
+
+
+@dataclass
+class Level:
+    """The exemplar at one scale, flattened: h * w pixels."""
+
+    pixels: torch.Tensor  # (h * w, 3); outside the region its mean colour
+    inside: torch.Tensor  # (h * w) bool, the region
+    valid: torch.Tensor  # (h * w) bool, the sources: pixels whose patch lies in the region
+    basis: torch.Tensor  # (D, 3, PATCH, PATCH)
+    features: torch.Tensor  # (h * w, D), the patch around each pixel projected on the basis
+    shape: tuple[int, int]
+
+
+@dataclass
+class Concept:
+    """What is learnt of a region: its patches over scales, the finest level first."""
+
+    levels: list[Level]
+
+
+@dataclass
+class Texture:
+    """pixels (H, W, 3) float32 in the exemplar's units; coordinates (H, W, 2) int64, row and column in the exemplar."""
+
+    pixels: np.ndarray
+    coordinates: np.ndarray
+
+
+def learn(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> Concept:
+    """The patches of an exemplar at every scale.
+
+    pixels (h, w, 3) float32, perceptually encoded, 0 to 1; mask (h, w) bool, the region.
+    Raises PaletteError when too few patches of PATCH x PATCH px lie in the region.
+    """
+    side = math.sqrt(mask.sum())
+    count = 1 + max(0, round(math.log2(max(1.0, side / COARSEST))))
+    step = 2 ** (count - 1)
+    pad = (0, -mask.shape[1] % step, 0, -mask.shape[0] % step)
+    weight = F.pad(torch.from_numpy(mask.astype(np.float32))[None, None], pad)
+    colour = F.pad(torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))[None], pad) * weight
+    levels = []
+    for i in range(count):
+        progress(i / count, "learning patches")
+        if i:
+            weight, colour = F.avg_pool2d(weight, 2), F.avg_pool2d(colour, 2)
+        level = _level(colour, weight)
+        if level is None:
+            break
+        levels.append(level)
+    if not levels:
+        raise PaletteError(
+            f"the region holds too few patches of {PATCH} x {PATCH} px; paint a wider area or use a larger photo"
+        )
+    return Concept(levels)
+
+
+def _level(colour: torch.Tensor, weight: torch.Tensor) -> Level | None:
+    inside = weight > 0.5
+    outside = F.pad(1 - inside.float(), (RADIUS,) * 4, value=1.0)
+    valid = (F.max_pool2d(outside, PATCH, 1) == 0).flatten()
+    sources = valid.nonzero()[:, 0]
+    if len(sources) < PATCH * PATCH:
+        return None
+    pixels = colour / weight.clamp_min(1e-6)
+    mean = (colour.sum((2, 3)) / weight.sum())[..., None, None]
+    pixels = torch.where(inside, pixels, mean)
+    window = _window()
+    # at most 20,000 patches decide the basis
+    some = sources[:: -(-len(sources) // 20_000)]
+    columns = pixels.shape[3]
+    offsets = (torch.arange(PATCH) - RADIUS)[:, None] * columns + torch.arange(PATCH) - RADIUS
+    flat = pixels[0].flatten(1)
+    patches = flat[:, some[:, None] + offsets.flatten()].permute(1, 0, 2).flatten(1) * window.repeat(3)
+    centred = patches - patches.mean(0)
+    _, vectors = torch.linalg.eigh(centred.T @ centred)
+    basis = (vectors[:, -COMPONENTS:].T * window.repeat(3)).reshape(-1, 3, PATCH, PATCH)
+    features = F.conv2d(pixels, basis, padding=RADIUS)[0].flatten(1).T.contiguous()
+    return Level(flat.T.contiguous(), inside.flatten(), valid, basis, features, tuple(pixels.shape[2:]))
+
+
+def _window() -> torch.Tensor:
+    """Square root of a Gaussian weight over the patch, (PATCH^2): the centre decides, the rim guides."""
+    g = torch.exp(-0.5 * ((torch.arange(PATCH) - RADIUS) / (PATCH / 3)) ** 2)
+    return (g[:, None] * g).sqrt().flatten()
+
+
+def sample(
+    concept: Concept, size: tuple[int, int], seed: int, progress: Progress, quality: str = "balanced"
+) -> Texture:
+    """A tileable texture of size (H, W) px, at the exemplar's scale.
+
+    quality is a key of ROUNDS. The same concept, size, quality and seed give the same texture, bit for bit.
+    """
+    coarse_rounds, finest_rounds = ROUNDS[quality]
+    generator = torch.Generator().manual_seed(seed)
+    sizes = [size]
+    while len(sizes) < len(concept.levels) and min(sizes[-1]) >= 8 * PATCH:
+        sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+    levels = concept.levels[: len(sizes)]
+    rounds = [coarse_rounds if i else finest_rounds for i in range(len(sizes))]
+    work = [h * w * n for (h, w), n in zip(sizes, rounds, strict=True)]
+    done = 0.0
+
+    def report(fraction: float) -> None:
+        progress(min(1.0, (done + fraction * share) / sum(work)), "sampling the texture")
+
+    share = 0
+    coordinates = _quilt(levels[-1], sizes[-1], generator, report)
+    for i in reversed(range(len(levels))):
+        level = levels[i]
+        if i < len(levels) - 1:
+            coordinates = _upsample(level, levels[i + 1], coordinates, sizes[i])
+        share = work[i] / rounds[i]
+        for _ in range(rounds[i]):
+            image = _vote(level, coordinates, report)
+            _search(level, image, coordinates, generator, report)
+            done += share
+    share = 0
+    image = _vote(levels[0], coordinates, report)
+    columns = levels[0].shape[1]
+    coordinates = torch.stack([coordinates // columns, coordinates % columns], -1)
+    shift = _calmest(image)
+    return Texture(image.roll(shift, (0, 1)).numpy(), coordinates.roll(shift, (0, 1)).numpy())
+
+
+def _calmest(image: torch.Tensor) -> tuple[int, int]:
+    """The roll that puts the border where the texture changes least: a torus may be cut anywhere."""
+    rows = (image - image.roll(1, 0)).abs().mean((1, 2))
+    columns = (image - image.roll(1, 1)).abs().mean((0, 2))
+    return -int(rows.argmin()), -int(columns.argmin())
+
+
+def _quilt(level: Level, size: tuple[int, int], generator: torch.Generator, report) -> torch.Tensor:
+    """Coordinates (H, W) of a toroidal quilt: blocks of the exemplar whose overlaps agree, all sources used alike.
+
+    A pixel belongs to the block whose centre is nearest; finding the best seam is left to `_search`.
+    """
+    h, w = size
+    stride = level.shape[1]
+    side, anchors = _block(level, min(h, w))
+    if len(anchors) > ANCHORS:
+        anchors = anchors[torch.randperm(len(anchors), generator=generator)[:ANCHORS]]
+    local = torch.arange(side)
+    blocks = anchors[:, None] + (local[:, None] * stride + local).flatten()
+    colours = level.pixels[blocks]
+    squares, colours = colours.square().sum(2), colours.flatten(1)
+    spread = level.pixels[level.inside].var(0).sum()
+    from_centre = (local - (side - 1) / 2).abs()
+    distance = torch.maximum(from_centre[:, None], from_centre).flatten()
+    canvas = torch.zeros(h * w, 3)
+    nearest = torch.full((h * w,), math.inf)
+    coordinates = torch.zeros(h * w, dtype=torch.long)
+    used = torch.zeros(len(level.pixels))
+    step = max(1, side * 2 // 3)
+    rows, columns = -(-h // step), -(-w // step)
+    # Blocks are laid in reading order; those on one wavefront do not touch, so they are laid at once.
+    for front in range(columns + 2 * rows - 2):
+        i = torch.arange(max(0, -(-(front - columns + 1) // 2)), min(rows - 1, front // 2) + 1)
+        j = front - 2 * i
+        y = ((i * h // rows)[:, None] + local) % h
+        x = ((j * w // columns)[:, None] + local) % w
+        place = (y[:, :, None] * w + x[:, None]).flatten(1)
+        known = torch.isfinite(nearest[place]).float()
+        target = canvas[place] * known[..., None]
+        error = known @ squares.T - 2 * (target.flatten(1) @ colours.T) + target.square().sum((1, 2))[:, None]
+        error = error / known.sum(1, keepdim=True).clamp_min(1) + spread * used[blocks[:, ::side]].mean(1)
+        best = error.topk(min(4, len(anchors)), largest=False).indices
+        pick = torch.randint(best.shape[1], (len(best), 1), generator=generator)
+        chosen = blocks[best.gather(1, pick)[:, 0]]
+        nearer = distance < nearest[place]
+        nearest[place] = torch.where(nearer, distance, nearest[place])
+        coordinates[place] = torch.where(nearer, chosen, coordinates[place])
+        canvas[place] = torch.where(nearer[..., None], level.pixels[chosen], canvas[place])
+        used += torch.bincount(chosen.flatten(), minlength=len(used)) * (level.inside.sum() / (h * w))
+        report(0.0)
+    return _to_sources(level, coordinates.reshape(h, w))
+
+
+def _block(level: Level, limit: int) -> tuple[int, torch.Tensor]:
+    """Side of the quilting blocks, and the top left corners (flattened) of those that lie in the region."""
+    eh, ew = level.shape
+    outside = 1 - level.inside.reshape(1, 1, eh, ew).float()
+    side = max(PATCH, int(min(limit // 2, math.sqrt(level.inside.sum()) * BLOCK, eh, ew)))
+    while True:
+        fits = F.max_pool2d(outside, side, 1)[0, 0] == 0
+        anchors = F.pad(fits, (0, side - 1, 0, side - 1)).flatten().nonzero()[:, 0]
+        if side == PATCH or len(anchors) >= 0.2 * level.inside.sum():
+            return side, anchors
+        side = max(PATCH, int(side * 0.85))
+
+
+def _upsample(level: Level, coarse: Level, coordinates: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    rows, columns = torch.arange(size[0])[:, None], torch.arange(size[1])
+    parent = coordinates[rows // 2, columns // 2]
+    y = parent // coarse.shape[1] * 2 + rows % 2
+    x = parent % coarse.shape[1] * 2 + columns % 2
+    return _to_sources(level, y * level.shape[1] + x)
+
+
+def _to_sources(level: Level, coordinates: torch.Tensor) -> torch.Tensor:
+    """Moves coordinates that are no source to the next one in reading order."""
+    sources = level.valid.nonzero()[:, 0]
+    rank = level.valid.cumsum(0)[coordinates].clamp_max(len(sources)) - level.valid[coordinates].long()
+    return sources[rank.clamp_max(len(sources) - 1)]
+
+
+def _bands(h: int, w: int) -> list[tuple[int, int]]:
+    rows = max(1, BAND // w)
+    return [(top, min(h, top + rows)) for top in range(0, h, rows)]
+
+
+def _neighbours(coordinates: torch.Tensor, top: int, end: int, dy: int, dx: int, stride: int) -> torch.Tensor:
+    """c(p + d) - d for the rows top to end, flattened: where the neighbour's source continues. May be no source."""
+    rows = torch.arange(top + dy, end + dy) % len(coordinates)
+    return (coordinates[rows].roll(-dx, 1) - (dy * stride + dx)).flatten()
+
+
+def _vote(level: Level, coordinates: torch.Tensor, report) -> torch.Tensor:
+    """The texture (H, W, 3): for each pixel the weighted mean of what the patches around it say."""
+    h, w = coordinates.shape
+    image = torch.empty(h * w, 3)
+    offsets = [(dy, dx, math.exp(-(dy * dy + dx * dx) / 8)) for dy in (-2, 0, 2) for dx in (-2, 0, 2)]
+    total = sum(g for *_, g in offsets)
+    for top, end in _bands(h, w):
+        part = image[top * w : end * w].zero_()
+        for dy, dx, g in offsets:
+            index = _neighbours(coordinates, top, end, dy, dx, level.shape[1])
+            part.add_(level.pixels.index_select(0, index), alpha=g / total)
+        report(0.2 * end / h)
+    return image.reshape(h, w, 3)
+
+
+def _search(level: Level, image: torch.Tensor, coordinates: torch.Tensor, generator: torch.Generator, report) -> None:
+    """One round of search; changes coordinates in place."""
+    h, w = coordinates.shape
+    stride = level.shape[1]
+    used = torch.bincount(coordinates.flatten(), minlength=len(level.valid)).float().reshape(1, 1, *level.shape)
+    used = F.avg_pool2d(used, 5, 1, 2).flatten() * (level.valid.sum() / (h * w))
+    penalty = None
+    for top, end in _bands(h, w):
+        rows = torch.arange(top - RADIUS, end + RADIUS) % h
+        wide = F.pad(image[rows].permute(2, 0, 1)[None], (RADIUS, RADIUS, 0, 0), mode="circular")
+        target = F.conv2d(wide, level.basis)[0].flatten(1).T.contiguous()
+        current = coordinates[top:end].flatten()
+        cost = (target - level.features.index_select(0, current)).square().sum(1)
+        if penalty is None:
+            penalty = used * (OCCURRENCE * cost.median())
+        cost += penalty[current]
+        report(0.2 + 0.8 * top / h)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                if dy or dx:
+                    # the band's own rows in their newest state, so that good sources travel far in one round
+                    coordinates[top:end] = current.reshape(-1, w)
+                    _improve(level, target, penalty, current, cost, _neighbours(coordinates, top, end, dy, dx, stride))
+            report(0.2 + 0.8 * top / h)
+        for reach in REACHES:
+            jump = torch.randint(-reach, reach + 1, (2, len(current)), generator=generator)
+            _improve(level, target, penalty, current, cost, current + jump[0] * stride + jump[1])
+            report(0.2 + 0.8 * top / h)
+        coordinates[top:end] = current.reshape(-1, w)
+
+
+def _improve(level: Level, target, penalty, current, cost, candidate) -> None:
+    """Takes the candidate sources that are better, in place."""
+    ok = (candidate != current) & (candidate >= 0) & (candidate < len(level.valid))
+    where = ok.nonzero()[:, 0]
+    where = where[level.valid[candidate[where]]]
+    q = candidate[where]
+    d = (target[where] - level.features.index_select(0, q)).square_().sum(1) + penalty[q]
+    better = d < cost[where]
+    where = where[better]
+    current[where] = q[better]
+    cost[where] = d[better]

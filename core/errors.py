@@ -1,0 +1,9 @@
+"""The two ways a run ends early."""
+
+
+class PaletteError(Exception):
+    """Bad input or a limit reached; the message names the file or setting and the way out."""
+
+
+class Cancelled(Exception):
+    """The user asked to stop; raised by the progress callback, never shown as a failure."""

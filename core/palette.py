@@ -1,0 +1,293 @@
+"""The pipeline: photo and regions in, a palette of tileable SVBRDF materials out. Knows nothing of Blender.
+
+photo + regions -> exemplar -> concept -> texture -> SVBRDF -> reduced SVBRDF -> files
+"""
+
+import dataclasses
+import json
+import os
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from . import brdf, decomposition, engines, reduction, sheet
+from .errors import Cancelled, PaletteError
+from .exemplar import cut_exemplar
+from .image import linear_from_srgb, srgb_from_linear, write_image
+from .material import SVBRDF
+from .region import Region, check_region, file_name
+
+VERSION = 1  # of palette.json
+QUALITIES = tuple(engines.patch.ROUNDS)
+RESOLUTION_RANGE = (64, 8192)
+PREVIEW = 256  # px
+MOST_AT_ONCE = 4  # regions; each holds its own working memory
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user chooses; the same for every region.
+
+    resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object;
+    flatten takes the slow change of illumination out of a region before synthesis.
+    """
+
+    engine: str = "patch"
+    quality: str = "balanced"
+    resolution: int = 1024
+    seed: int = 0
+    flatten: bool = True
+    metres_per_tile: float = 1.0
+
+    def check(self) -> None:
+        """Raise PaletteError naming the first setting that cannot be honoured."""
+        if self.engine not in engines.ENGINES:
+            raise PaletteError(f"engine '{self.engine}' is unknown; choose one of: {', '.join(engines.ENGINES)}")
+        if self.quality not in QUALITIES:
+            raise PaletteError(f"quality '{self.quality}' is unknown; choose one of: {', '.join(QUALITIES)}")
+        least, most = RESOLUTION_RANGE
+        if not least <= self.resolution <= most:
+            raise PaletteError(f"resolution {self.resolution} px is out of range; choose {least} to {most} px")
+        if not 0 <= self.seed < 2**63:
+            raise PaletteError(f"seed {self.seed} is out of range; choose a whole number from 0 to 2^63 - 1")
+        if not (0 < self.metres_per_tile < float("inf")):
+            raise PaletteError(f"metres per tile is {self.metres_per_tile}; choose a positive length")
+
+
+@dataclass
+class Material:
+    """One region's outcome. status is "ok", or "failed" with the reason in error and no SVBRDF.
+
+    exemplar (h, w, 3) and texture (H, W, 3) are sRGB-encoded uint8 for looking at; preview (256, 256, 4) float32 is
+    a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced says which maps became values.
+    """
+
+    name: str
+    status: str = "ok"
+    svbrdf: SVBRDF | None = None
+    reduced: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    error: str | None = None
+    metres_per_tile: float = 1.0
+    exemplar: np.ndarray | None = None
+    texture: np.ndarray | None = None
+    preview: np.ndarray | None = None
+
+
+@dataclass
+class Palette:
+    """photo (H, W, 3) float32 linear, its regions and, in the same order, their materials."""
+
+    photo: np.ndarray
+    photo_name: str
+    regions: list[Region]
+    settings: Settings
+    materials: list[Material]
+    seconds: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+def extract_palette(
+    pixels: np.ndarray,
+    regions: list[Region],
+    settings: Settings,
+    progress: Progress,
+    on_material: Callable[[Material], None] | None = None,
+    photo_name: str = "",
+) -> Palette:
+    """Extract one material per region of a photo (H, W, 3) float32 linear.
+
+    A region that cannot be extracted becomes a material with status "failed"; the others are finished. on_material is
+    called with each material as soon as it is done. progress and on_material are called from worker threads, one at a
+    time; progress may raise Cancelled, which ends the call.
+    Raises PaletteError for settings that cannot be honoured and when there is no region.
+    """
+    settings.check()
+    if not regions:
+        raise PaletteError("there is no region; paint one or choose automatic segmentation")
+    start = time.perf_counter()
+    fractions = [0.0] * len(regions)
+    turn = threading.Lock()
+    stopped = threading.Event()
+
+    def extract(i: int) -> Material:
+        def report(fraction: float, message: str) -> None:
+            with turn:
+                if stopped.is_set():
+                    raise Cancelled
+                fractions[i] = max(fractions[i], fraction)
+                progress(sum(fractions) / len(regions), f"{regions[i].name}: {message}")
+
+        try:
+            material = extract_material(pixels, regions[i], settings, report)
+        except PaletteError as error:
+            material = Material(regions[i].name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
+        with turn:
+            fractions[i] = 1.0
+            if on_material and not stopped.is_set():
+                on_material(material)
+        return material
+
+    with _one_thread_each(), ThreadPoolExecutor(min(len(regions), os.cpu_count() or 1, MOST_AT_ONCE)) as pool:
+        extracting = [pool.submit(extract, i) for i in range(len(regions))]
+        try:
+            materials = [future.result() for future in extracting]
+        except BaseException:
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+    progress(1.0, "done")
+    palette = Palette(pixels, photo_name, regions, settings, materials)
+    for material in materials:
+        for stage, seconds in material.seconds.items():
+            palette.seconds[stage] = palette.seconds.get(stage, 0.0) + seconds
+    palette.seconds["extract"] = time.perf_counter() - start
+    return palette
+
+
+@contextmanager
+def _one_thread_each():
+    """Regions run side by side on one torch thread each: threads within an operation wait on each other when a core is
+    busy with something else, such as Blender's window, and then lose far more than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def extract_material(pixels: np.ndarray, region: Region, settings: Settings, progress: Progress) -> Material:
+    """Extract the material of one region of a photo (H, W, 3) float32 linear.
+
+    Raises PaletteError for settings that cannot be honoured and for a region too small to hold a texture.
+    """
+    settings.check()
+    check_region(region)
+    engine = engines.ENGINES[settings.engine]
+    material = Material(region.name, metres_per_tile=settings.metres_per_tile)
+    seconds = material.seconds
+
+    progress(0.0, "cutting the exemplar")
+    with _timed(seconds, "exemplar"):
+        exemplar = cut_exemplar(pixels, region.mask, settings.flatten)
+        encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
+        material.warnings += exemplar.warnings
+        material.exemplar = sheet.thumbnail(np.where(exemplar.mask[..., None], encoded, 0.1))
+
+    if exemplar.uniform is not None:
+        material.warnings.append("the region has one colour up to noise; the material is a constant")
+        svbrdf = decomposition.constant(exemplar.uniform)
+    else:
+        with _timed(seconds, "learn"):
+            concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.02, 0.06))
+        with _timed(seconds, "sample"):
+            size = settings.resolution, settings.resolution
+            texture = engine.sample(concept, size, settings.seed, _part(progress, 0.06, 0.86), settings.quality)
+            material.texture = sheet.thumbnail(np.tile(texture.pixels, (2, 2, 1)))
+        with _timed(seconds, "decompose"):
+            svbrdf = decomposition.decompose(linear_from_srgb(texture.pixels), _part(progress, 0.86, 0.96))
+
+    progress(0.97, "reducing the maps")
+    with _timed(seconds, "reduce"):
+        material.svbrdf, material.reduced = reduction.reduce(svbrdf)
+    with _timed(seconds, "preview"):
+        sphere = brdf.render_sphere(material.svbrdf, PREVIEW)
+        material.preview = np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
+    progress(1.0, "done")
+    return material
+
+
+def write_material(material: Material, folder: Path) -> dict:
+    """Write a material's maps and its .json into `folder` (made if missing); return its record for palette.json.
+
+    Files in the record are relative to the folder's parent. Normal Map convention is OpenGL (+Y up).
+    """
+    name = file_name(material.name)
+    record = {
+        "name": material.name,
+        "status": material.status,
+        "maps": {},
+        "metres_per_tile": material.metres_per_tile,
+        "seconds": {stage: round(s, 3) for stage, s in material.seconds.items()},
+        "reduced": material.reduced,
+        "warnings": material.warnings,
+        "error": material.error,
+    }
+    if material.svbrdf is None:
+        return record
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def entry(kind: str, value: np.ndarray | float, encoded: np.ndarray | None, bits: int = 8, **more) -> None:
+        if encoded is None:
+            record["maps"][kind] = {"value": value.tolist() if isinstance(value, np.ndarray) else value}
+        else:
+            file = f"{name}_{kind}.png"
+            write_image(folder / file, encoded, bits)
+            record["maps"][kind] = {"file": f"{folder.name}/{file}", **more}
+
+    svbrdf = material.svbrdf
+    is_map = svbrdf.albedo.ndim > 1
+    entry("basecolor", svbrdf.albedo, srgb_from_linear(svbrdf.albedo) if is_map else None)
+    entry("normal", svbrdf.normal, (svbrdf.normal + 1) / 2 if svbrdf.normal.ndim > 1 else None)
+    entry("roughness", svbrdf.roughness, svbrdf.roughness if np.ndim(svbrdf.roughness) else None)
+    if svbrdf.height is None:
+        entry("height", 0.0, None)
+    else:
+        # the 16 bits span the relief; height = (pixel - 0.5) * scale, in tile widths
+        scale = max(2 * float(np.abs(svbrdf.height).max()), 1e-9)
+        entry("height", 0.0, svbrdf.height / scale + 0.5, 16, scale=scale, midlevel=0.5)
+    _write_json(folder / f"{name}.json", record)
+    return record
+
+
+def write_palette(palette: Palette, folder: Path, progress: Progress = lambda fraction, message: None) -> dict:
+    """Write maps, masks/, palette.json and palette.png into an empty folder; return what palette.json holds."""
+    start = time.perf_counter()
+    records = []
+    for i, material in enumerate(palette.materials):
+        progress(0.8 * i / len(palette.materials), f"writing {material.name}")
+        records.append(write_material(material, folder / file_name(material.name)))
+    (folder / "masks").mkdir()
+    for region in palette.regions:
+        write_image(folder / "masks" / f"{file_name(region.name)}.png", region.mask.astype(np.float32))
+    progress(0.85, "writing the contact sheet")
+    write_image(folder / "palette.png", sheet.contact_sheet(palette))
+    seconds = palette.seconds | {"write": time.perf_counter() - start}
+    content = {
+        "version": VERSION,
+        "photo": palette.photo_name,
+        "settings": dataclasses.asdict(palette.settings),
+        "seconds": {stage: round(s, 3) for stage, s in seconds.items()},
+        "warnings": palette.warnings,
+        "materials": records,
+    }
+    _write_json(folder / "palette.json", content)
+    progress(1.0, "written")
+    return content
+
+
+def _write_json(path: Path, content: dict) -> None:
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _part(progress: Progress, start: float, end: float, prefix: str = "") -> Progress:
+    """Progress of a stage, mapped to its part of the whole."""
+    return lambda fraction, message: progress(start + (end - start) * fraction, prefix + message)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str):
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start

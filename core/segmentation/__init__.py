@@ -1,0 +1,36 @@
+"""Automatic regions: a photo to its materials' masks, by engines chosen by name."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import PaletteError
+from ..region import Region
+from .superpixels import segment_auto
+
+SEGMENTERS = {"auto": segment_auto}
+MOST_REGIONS = 32
+
+
+def segment(
+    photo_pixels: np.ndarray,
+    engine: str = "auto",
+    regions: int = 6,
+    seed: int = 0,
+    progress: Callable[[float, str], None] = lambda fraction, message: None,
+) -> list[Region]:
+    """At most `regions` regions of a photo (H, W, 3) linear float32, disjoint, by decreasing area.
+
+    They need not cover the photo: what is too small to hold a texture is left out.
+    Raises PaletteError for an unknown engine, a number of regions outside 1..32, or a photo without any region.
+    """
+    if engine not in SEGMENTERS:
+        raise PaletteError(f"There is no segmentation '{engine}'; there is: {', '.join(sorted(SEGMENTERS))}.")
+    if not 1 <= regions <= MOST_REGIONS:
+        raise PaletteError(f"The number of regions is {regions}; it must be from 1 to {MOST_REGIONS}.")
+    found = SEGMENTERS[engine](photo_pixels, regions, seed, progress)
+    if not found:
+        raise PaletteError(
+            f"Segmentation '{engine}' found no region large enough to hold a texture. Use a larger photo or paint masks."
+        )
+    return found

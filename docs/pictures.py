@@ -1,0 +1,99 @@
+"""Makes the README's pictures from the palettes of the two bundled examples: the sheet, and a render by Cycles.
+
+    .venv/bin/python docs/pictures.py
+
+extracts both examples into demo/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg. 3 minutes.
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+sys.path.insert(0, str(ROOT))
+import dev  # noqa: E402
+
+dev.load_package()
+import bpy  # noqa: E402
+from material_palette.core.command import main  # noqa: E402
+
+SHEETS = {"viaduct": "demo", "facade": "facade"}
+SHOWN = [("viaduct", "masonry"), ("viaduct", "rubble"), ("facade", "stone_wall"), ("facade", "red_wood")]
+REPEATS = 1.5  # of the tile along a cube's side
+
+
+def extract(example: str) -> Path:
+    source, folder = ROOT / "examples" / example, ROOT / "demo" / "pictures" / example
+    where = ["--masks", str(source / "masks"), "--overwrite", "-o", str(folder)]
+    if main(["extract", str(source / "photo.jpg"), *where]):
+        raise SystemExit(f"the example {example} could not be extracted")
+    return folder
+
+
+def save(picture, path: Path, width: int) -> None:
+    height = round(picture.shape[0] * width / picture.shape[1])
+    small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path), small, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def build_scene(folders: dict[str, Path]) -> None:
+    """A sphere and a cube of each material on a grey floor, under a sun and a sky."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    for example, folder in folders.items():
+        wanted = [name for e, name in SHOWN if e == example]
+        with bpy.data.libraries.load(str(folder / "palette.blend")) as (_, to):
+            to.materials = wanted
+    for i, (_, name) in enumerate(SHOWN):
+        x = (i - (len(SHOWN) - 1) / 2) * 2.4
+        material = bpy.data.materials[name]
+        bpy.ops.mesh.primitive_uv_sphere_add(segments=96, ring_count=48, radius=0.95, location=(x, 0, 0.95))
+        place(bpy.context.object, material, 3, 1.5)
+        bpy.ops.object.shade_smooth()
+        bpy.ops.mesh.primitive_plane_add(size=2.3, location=(x, 1.6, 1.15), rotation=(1.5708, 0, 0))
+        place(bpy.context.object, material, REPEATS, REPEATS)
+    bpy.ops.mesh.primitive_plane_add(size=60)
+    grey = bpy.data.materials.new("floor")
+    grey.diffuse_color = (0.2, 0.2, 0.2, 1)
+    bpy.context.object.data.materials.append(grey)
+    bpy.ops.object.light_add(type="SUN", rotation=(0.7, -0.5, 0))
+    bpy.context.object.data.energy = 3.5
+    world = bpy.data.worlds.new("sky")
+    scene.world = world
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.75, 0.85, 1.0, 1)
+    world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.6
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (0, -11.5, 2.6), (1.447, 0, 0)
+    camera.data.lens = 40
+    scene.camera = camera
+
+
+def place(thing, material, across: float, up: float) -> None:
+    """Assign the material and scale the object's UV map to so many repeats."""
+    thing.data.materials.append(material)
+    for corner in thing.data.uv_layers.active.data:
+        corner.uv = (corner.uv[0] * across, corner.uv[1] * up)
+
+
+def render(path: Path) -> None:
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.seed = 96, 0
+    scene.render.resolution_x, scene.render.resolution_y = 1400, 520
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+
+
+if __name__ == "__main__":
+    folders = {example: extract(example) for example in SHEETS}
+    for example, name in SHEETS.items():
+        save(cv2.imread(str(folders[example] / "palette.png")), DOCS / f"{name}.jpg", 1400)
+    build_scene(folders)
+    rendered = ROOT / "demo" / "pictures" / "render.png"
+    render(rendered)
+    save(cv2.imread(str(rendered)), DOCS / "render.jpg", 1400)

@@ -1,0 +1,162 @@
+"""Open Photo, and the photo as linear pixels for a worker that must not touch bpy."""
+
+import os
+
+import bpy
+import numpy as np
+from bpy.props import StringProperty
+from bpy.types import Operator
+
+from ..core.errors import PaletteError
+from .setup import missing_sentence
+
+# Image.colorspace_settings names, with those of other configurations that mean the same.
+_SRGB = {"sRGB", "sRGB - Texture"}
+_LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Linear BT.709"}
+
+
+def photo_reader(image):
+    """Return a function without arguments and without bpy that gives the photo's (H, W, 3) linear Rec.709 pixels.
+
+    An untouched file is read from disk, where its colour profile is; a packed, generated or edited image is read from
+    Blender now. The function returns (pixels, warnings). Raises PaletteError when the image can't be a photo.
+    """
+    if image is None:
+        raise PaletteError("No photo: open one first")
+    if image.source not in {"FILE", "GENERATED"}:
+        raise PaletteError(f"Photo '{image.name}' is a {image.source.lower()}; a single picture is needed")
+    path = bpy.path.abspath(image.filepath_raw, library=image.library)
+    if image.source == "FILE" and not image.packed_file and not image.is_dirty:
+        if not os.path.isfile(path):
+            raise PaletteError(f"Photo '{image.name}' is not where it was: {path}")
+        if _is_turned(path):
+            raise PaletteError(f"Photo '{image.name}' lies on its side in its file; Open Photo turns it upright")
+        return _file_reader(path)
+    pixels = read_pixels(image)
+    return lambda: (pixels, [])
+
+
+def _file_reader(path):
+    def read():
+        from ..core.image import read_photo
+
+        photo = read_photo(path)
+        return photo.pixels, photo.warnings
+
+    return read
+
+
+def read_pixels(image):
+    """Return Blender's own pixels of `image` as (H, W, 3) float32 linear Rec.709, top row first.
+
+    Raises PaletteError when there are no pixels or their colour space can't be told.
+    """
+    from ..core.image import linear_from_srgb
+
+    width, height = image.size
+    if not image.has_data and not (width and height):
+        raise PaletteError(f"Photo '{image.name}' has no pixels; is its file still there?")
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels = pixels.reshape(height, width, 4)[::-1, :, :3]
+    space = image.colorspace_settings.name
+    if image.is_float:  # Blender has them in its working space, which the file chooses from 5.0 on
+        working = getattr(getattr(bpy.data, "colorspace", None), "working_space", "Linear Rec.709")
+        if working != "Linear Rec.709":
+            raise PaletteError(f"The file's working space is {working}; photos with float pixels need Linear Rec.709")
+        return np.maximum(pixels, 0.0)
+    if space in _SRGB:
+        return linear_from_srgb(pixels)
+    if space in _LINEAR:
+        return np.ascontiguousarray(pixels)
+    raise PaletteError(f"Photo '{image.name}' is in colour space {space}; set it to sRGB")
+
+
+def _is_turned(path):
+    return _orientation(path) not in (0, 1)
+
+
+def _orientation(path):
+    """EXIF orientation 1..8 of the file, 1 when it has none; Blender shows pixels as they are stored."""
+    import OpenImageIO as oiio
+
+    picture = oiio.ImageInput.open(path)
+    if picture is None:
+        oiio.geterror()
+        return 1
+    try:
+        return picture.spec().get_int_attribute("Orientation", 1)
+    finally:
+        picture.close()
+
+
+def _open(path):
+    """Load `path` as an image, upright; raises PaletteError with the file's name when it is no picture."""
+    if _is_turned(path):
+        return _upright_copy(path)
+    try:
+        image = bpy.data.images.load(path, check_existing=True)
+    except RuntimeError as error:
+        raise PaletteError(f"Can't open {path}: {error}") from error
+    if image.size[0] == 0:
+        if image.users == 0:
+            bpy.data.images.remove(image)
+        raise PaletteError(f"Not a picture, or a damaged one: {path}")
+    return image
+
+
+def _upright_copy(path):
+    from ..core.image import read_photo, srgb_from_linear
+
+    pixels = read_photo(path).pixels
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new(os.path.basename(path), width, height, alpha=False)
+    rgba = np.ones((height, width, 4), np.float32)
+    rgba[..., :3] = np.clip(srgb_from_linear(pixels[::-1]), 0.0, 1.0)
+    image.pixels.foreach_set(rgba.ravel())
+    image.pack()
+    return image
+
+
+class MATERIAL_PALETTE_OT_open_photo(Operator):
+    """Open the photo that materials are extracted from"""
+
+    bl_idname = "material_palette.open_photo"
+    bl_label = "Open Photo"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, context):
+        sentence = missing_sentence()
+        if sentence:
+            cls.poll_message_set(sentence)
+        return not sentence
+
+    def invoke(self, context, event):
+        if self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context):
+        path = bpy.path.abspath(self.filepath)
+        if not os.path.isfile(path):
+            self.report({"ERROR"}, f"No such file: {path}")
+            return {"CANCELLED"}
+        try:
+            image = _open(path)
+        except PaletteError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        context.scene.material_palette.photo = image
+        space = context.space_data
+        if space is not None and space.type == "IMAGE_EDITOR":
+            space.image = image
+        return {"FINISHED"}
+
+
+CLASSES = (MATERIAL_PALETTE_OT_open_photo,)

@@ -1,0 +1,310 @@
+"""Regions: masks painted over the photo, one 8-bit image each, white where the region is."""
+
+import colorsys
+import os
+
+import bpy
+import numpy as np
+from bpy.app.handlers import persistent
+from bpy.props import BoolProperty, StringProperty
+from bpy.types import Operator
+
+from ..core.errors import PaletteError
+from .setup import missing_sentence
+
+_GOLDEN_RATIO = 0.618034  # hues this far apart stay distinct however many there are
+
+
+def add_region(settings, name, mask, automatic=False):
+    """Add a region with a mask image of its own to a scene's settings and return it.
+
+    mask: (H, W) bool, top row first, or None for an empty one of the photo's size.
+    """
+    name = _unused_name(settings, name)
+    if mask is None:
+        width, height = settings.photo.size
+        mask = np.zeros((height, width), bool)
+    region = settings.regions.add()
+    region.name = name
+    region.mask = _mask_image(name, mask)
+    region.colour = colorsys.hsv_to_rgb((len(settings.regions) - 1) * _GOLDEN_RATIO % 1.0, 0.75, 1.0)
+    region.automatic = automatic
+    settings.active_region = len(settings.regions) - 1
+    return region
+
+
+def remove_region(settings, index):
+    """Remove a region, and its mask image unless something else uses it."""
+    mask = settings.regions[index].mask
+    settings.regions.remove(index)
+    settings.active_region = min(settings.active_region, max(0, len(settings.regions) - 1))
+    if mask is not None and mask.users == 0:
+        bpy.data.images.remove(mask)
+
+
+def read_mask_image(region):
+    """Return a region's mask as (H, W) bool, top row first: any pixel that isn't black belongs.
+
+    Raises PaletteError when the mask image or its pixels are gone.
+    """
+    image = region.mask
+    if image is None:
+        raise PaletteError(f"Region '{region.name}' has no mask image: remove it, or choose one")
+    width, height = image.size
+    if not (width and height):
+        raise PaletteError(f"Region '{region.name}': its mask image '{image.name}' has no pixels")
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    return (pixels.reshape(height, width, 4)[::-1, :, :3] > 0.0).any(-1)
+
+
+def follow_active_region(settings, context):
+    """Where an Image Editor shows a region's mask, show the active region's instead."""
+    if not (context.window_manager and settings.active_region < len(settings.regions)):
+        return
+    masks = {region.mask for region in settings.regions}
+    active = settings.regions[settings.active_region].mask
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "IMAGE_EDITOR" and area.spaces.active.image in masks and active is not None:
+                area.spaces.active.image = active
+
+
+@persistent
+def pack_masks_before_save(*_args):
+    """Painted pixels live in memory only: put them into the file that is being saved."""
+    for scene in bpy.data.scenes:
+        for region in scene.material_palette.regions:
+            if region.mask is not None and region.mask.is_dirty:
+                region.mask.pack()
+
+
+def _mask_image(name, mask):
+    height, width = mask.shape
+    image = bpy.data.images.new(f"{name} mask", width, height, alpha=False)
+    image.colorspace_settings.name = "Non-Color"
+    rgba = np.ones((height, width, 4), np.float32)
+    rgba[..., :3] = mask[::-1, :, None]
+    image.pixels.foreach_set(rgba.ravel())
+    # undo and saving keep packed pixels only
+    image.pack()
+    return image
+
+
+def _unused_name(settings, name):
+    taken = {region.name for region in settings.regions}
+    unused, number = name, 1
+    while unused in taken:
+        number += 1
+        unused = f"{name} {number}"
+    return unused
+
+
+def _image_editor(context):
+    """The Image Editor under the mouse, else the largest of the window, else None."""
+    if context.area is not None and context.area.type == "IMAGE_EDITOR":
+        return context.area
+    areas = [area for area in context.window.screen.areas if area.type == "IMAGE_EDITOR"] if context.window else []
+    return max(areas, key=lambda area: area.width * area.height, default=None)
+
+
+def _paint_white(context):
+    """White belongs to the region, black (Ctrl held) does not."""
+    paint = context.scene.tool_settings.image_paint
+    # moved into each paint mode with Blender 5.0
+    unified = getattr(paint, "unified_paint_settings", None) or context.scene.tool_settings.unified_paint_settings
+    for owner in (unified, paint.brush):
+        # an essential brush of a library refuses changes; the unified colour is what counts then
+        if owner is not None and getattr(owner, "is_editable", True):
+            owner.color = (1.0, 1.0, 1.0)
+            owner.secondary_color = (0.0, 0.0, 0.0)
+
+
+class _NeedsPhoto:
+    @classmethod
+    def poll(cls, context):
+        if context.scene.material_palette.photo is not None:
+            return True
+        cls.poll_message_set("Open a photo first")
+        return False
+
+
+class _NeedsRegion:
+    @classmethod
+    def poll(cls, context):
+        settings = context.scene.material_palette
+        if settings.active_region < len(settings.regions):
+            return True
+        cls.poll_message_set("There is no region")
+        return False
+
+
+class MATERIAL_PALETTE_OT_add_region(_NeedsPhoto, Operator):
+    """Add an empty region, to be painted over the photo"""
+
+    bl_idname = "material_palette.add_region"
+    bl_label = "Add Region"
+    bl_options = {"REGISTER", "UNDO"}
+
+    name: StringProperty(name="Name", default="Region", options={"SKIP_SAVE"})
+
+    def execute(self, context):
+        settings = context.scene.material_palette
+        if not all(settings.photo.size):
+            self.report({"ERROR"}, f"Photo '{settings.photo.name}' has no pixels; is its file still there?")
+            return {"CANCELLED"}
+        add_region(settings, self.name, None)
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_OT_remove_region(_NeedsRegion, Operator):
+    """Remove the active region and its mask"""
+
+    bl_idname = "material_palette.remove_region"
+    bl_label = "Remove Region"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        settings = context.scene.material_palette
+        remove_region(settings, settings.active_region)
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_OT_paint_region(_NeedsRegion, Operator):
+    """Paint the active region in the Image Editor: white adds, black (Ctrl) takes away"""
+
+    bl_idname = "material_palette.paint_region"
+    bl_label = "Paint Region"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        settings = context.scene.material_palette
+        region = settings.regions[settings.active_region]
+        if region.mask is None:
+            self.report({"ERROR"}, f"Region '{region.name}' has no mask image")
+            return {"CANCELLED"}
+        area = _image_editor(context)
+        if area is None:
+            self.report({"ERROR"}, "No Image Editor in this window to paint in: open one beside this editor")
+            return {"CANCELLED"}
+        space = area.spaces.active
+        space.image = region.mask
+        space.mode = "PAINT"
+        _paint_white(context)
+        region.automatic = False
+        area.tag_redraw()
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_OT_show_photo(_NeedsPhoto, Operator):
+    """Show the photo in the Image Editor again"""
+
+    bl_idname = "material_palette.show_photo"
+    bl_label = "Show Photo"
+    bl_options = {"REGISTER"}
+
+    def execute(self, context):
+        area = _image_editor(context)
+        if area is None:
+            self.report({"ERROR"}, "No Image Editor in this window")
+            return {"CANCELLED"}
+        area.spaces.active.mode = "VIEW"
+        area.spaces.active.image = context.scene.material_palette.photo
+        return {"FINISHED"}
+
+
+class _ChoosesFolder:
+    """Mixin: a folder from the file browser, or from the property `directory` in scripts."""
+
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_image: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context, event):
+        if self.directory:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+
+class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, Operator):
+    """Add one region for each mask image of a folder, named after its file; any pixel that isn't black belongs"""
+
+    bl_idname = "material_palette.import_masks"
+    bl_label = "Import Masks"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        sentence = missing_sentence()
+        if not sentence and context.scene.material_palette.photo is None:
+            sentence = "Open a photo first"
+        if sentence:
+            cls.poll_message_set(sentence)
+        return not sentence
+
+    def execute(self, context):
+        from ..core.region import read_regions
+
+        settings = context.scene.material_palette
+        try:
+            regions = read_regions(bpy.path.abspath(self.directory), tuple(settings.photo.size)[::-1])
+        except PaletteError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        # the folder is what the user edits elsewhere: importing it again brings the masks up to date
+        names = {region.name for region in regions}
+        for index in reversed(range(len(settings.regions))):
+            if settings.regions[index].name in names:
+                remove_region(settings, index)
+        for region in regions:
+            add_region(settings, region.name, region.mask)
+        self.report({"INFO"}, f"{len(regions)} regions imported")
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, Operator):
+    """Write every region's mask as NAME.png into a folder, to be edited or passed to the command line"""
+
+    bl_idname = "material_palette.export_masks"
+    bl_label = "Export Masks"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context):
+        sentence = missing_sentence()
+        if not sentence and not context.scene.material_palette.regions:
+            sentence = "There is no region"
+        if sentence:
+            cls.poll_message_set(sentence)
+        return not sentence
+
+    def execute(self, context):
+        from ..core.image import write_image
+        from ..core.region import file_name
+
+        folder = bpy.path.abspath(self.directory)
+        regions = context.scene.material_palette.regions
+        try:
+            masks = {file_name(region.name): read_mask_image(region) for region in regions}
+            if len(masks) < len(regions):
+                raise PaletteError("Two regions would have the same file name; rename one")
+            if not os.path.isdir(folder):
+                raise PaletteError(f"No such folder: {folder}")
+            for name, mask in masks.items():
+                write_image(os.path.join(folder, f"{name}.png"), mask.astype(np.float32))
+        except (PaletteError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(masks)} masks written to {folder}")
+        return {"FINISHED"}
+
+
+CLASSES = (
+    MATERIAL_PALETTE_OT_add_region,
+    MATERIAL_PALETTE_OT_remove_region,
+    MATERIAL_PALETTE_OT_paint_region,
+    MATERIAL_PALETTE_OT_show_photo,
+    MATERIAL_PALETTE_OT_import_masks,
+    MATERIAL_PALETTE_OT_export_masks,
+)

@@ -1,0 +1,151 @@
+"""What a scene remembers (photo, regions, settings, palette) and what the window shows of a run."""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+from bpy.types import Image, Material, PropertyGroup
+
+# As in core.palette, which can't be imported where torch is missing; a test holds the two together.
+QUALITIES = (
+    ("draft", "Draft", "Fast and rough, for a first look"),
+    ("balanced", "Balanced", "Good textures in a reasonable time"),
+    ("best", "Best", "The closest textures, slowest"),
+)
+ENGINES = (("patch", "Patch", "Grow the texture from the region's own patches; needs no network and no GPU"),)
+RESOLUTION_RANGE = (64, 8192)
+# Paths that start with "//"; from Blender 4.5 on a property has to say that it takes them.
+_BLEND_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+
+
+def _photo_is_a_picture(settings, image):
+    return image.type == "IMAGE" and all(image != region.mask for region in settings.regions)
+
+
+def _show_active_mask(settings, context):
+    from .operators.regions import follow_active_region
+
+    follow_active_region(settings, context)
+
+
+class MATERIAL_PALETTE_PG_region(PropertyGroup):
+    # `name` comes with every PropertyGroup and becomes the material's name
+    mask: PointerProperty(name="Mask", type=Image, description="White where the region is, the size of the photo")
+    colour: FloatVectorProperty(
+        name="Colour",
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        max=1.0,
+        description="Colour of the region over the photo",
+    )
+    enabled: BoolProperty(name="Extract", default=True, description="Extract a material from this region")
+    automatic: BoolProperty(
+        name="Automatic",
+        description="Found by Auto Segment, which replaces it the next time it runs; painting keeps it",
+    )
+
+
+class MATERIAL_PALETTE_PG_extracted(PropertyGroup):
+    # `name` is the region's name
+    material: PointerProperty(name="Material", type=Material)
+    warnings: StringProperty(name="Warnings", description="What went less well than it could, one per line")
+
+
+class MATERIAL_PALETTE_PG_settings(PropertyGroup):
+    photo: PointerProperty(
+        name="Photo", type=Image, poll=_photo_is_a_picture, description="The photo that materials are extracted from"
+    )
+    regions: CollectionProperty(type=MATERIAL_PALETTE_PG_region)
+    active_region: IntProperty(name="Active Region", min=0, update=_show_active_mask, options={"SKIP_SAVE"})
+    auto_regions: IntProperty(
+        name="Regions", default=6, min=1, max=64, soft_max=16, description="The most regions Auto Segment makes"
+    )
+
+    engine: EnumProperty(name="Engine", items=ENGINES, description="How a region becomes a texture")
+    quality: EnumProperty(name="Quality", items=QUALITIES, default="balanced", description="Speed against closeness")
+    resolution: IntProperty(
+        name="Resolution",
+        default=1024,
+        min=RESOLUTION_RANGE[0],
+        max=RESOLUTION_RANGE[1],
+        soft_max=4096,
+        subtype="PIXEL",
+        description="Width and height of every map",
+    )
+    seed: IntProperty(name="Seed", min=0, description="The same seed gives the same textures, another one a variation")
+    metres_per_tile: FloatProperty(
+        name="Tile Size",
+        default=1.0,
+        min=0.001,
+        soft_max=100.0,
+        unit="LENGTH",
+        description="How wide one tile of the texture is on a surface whose UV map is in metres",
+    )
+    flatten: BoolProperty(
+        name="Flatten Light", default=True, description="Take slow changes of light out of the photo before synthesis"
+    )
+    pack: BoolProperty(
+        name="Pack Textures",
+        default=True,
+        description="Store the textures in the .blend file; else they are written to the output folder",
+    )
+    output_folder: StringProperty(
+        name="Output Folder",
+        default="//palette",
+        subtype="DIR_PATH",
+        options=_BLEND_RELATIVE,
+        description="Where the textures are written",
+    )
+    overwrite: BoolProperty(name="Overwrite", description="Replace what the output folder holds")
+
+    palette: CollectionProperty(type=MATERIAL_PALETTE_PG_extracted)
+    active_material: IntProperty(name="Active Material", min=0, options={"SKIP_SAVE"})
+
+
+def _run(attribute):
+    def get(_state):
+        from .operators import background
+
+        return getattr(background.state(), attribute)
+
+    return get
+
+
+class MATERIAL_PALETTE_PG_run(PropertyGroup):
+    """Read from the run itself, so no file can keep a run that has ended."""
+
+    running: BoolProperty(name="Running", get=_run("running"))
+    progress: FloatProperty(name="Progress", subtype="FACTOR", min=0.0, max=1.0, get=_run("progress"))
+    message: StringProperty(name="Message", get=_run("message"))
+    seconds_left: FloatProperty(name="Seconds Left", description="-1 while unknown", get=_run("seconds_left"))
+    error: StringProperty(name="Error", description="Why the last run failed", get=_run("error"))
+
+
+_CLASSES = (
+    MATERIAL_PALETTE_PG_region,
+    MATERIAL_PALETTE_PG_extracted,
+    MATERIAL_PALETTE_PG_settings,
+    MATERIAL_PALETTE_PG_run,
+)
+
+
+def register():
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.material_palette = PointerProperty(type=MATERIAL_PALETTE_PG_settings)
+    bpy.types.WindowManager.material_palette_run = PointerProperty(type=MATERIAL_PALETTE_PG_run)
+
+
+def unregister():
+    del bpy.types.WindowManager.material_palette_run
+    del bpy.types.Scene.material_palette
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,475 @@
+"""The operators as a script in background mode runs them: results through scene properties, refusals by name."""
+
+import threading
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from material_palette.core.errors import PaletteError
+
+
+def refused(operator, **properties):
+    """Call an operator that has to refuse; return what it says."""
+    with pytest.raises(RuntimeError) as error:
+        operator(**properties)
+    return str(error.value)
+
+
+@pytest.fixture
+def ready(settings, photo_and_masks):
+    """A scene with a photo and two regions, set to the smallest and fastest palette."""
+    photo, masks = photo_and_masks
+    assert bpy.ops.material_palette.open_photo(filepath=str(photo)) == {"FINISHED"}
+    assert bpy.ops.material_palette.import_masks(directory=str(masks)) == {"FINISHED"}
+    settings.resolution = 64
+    settings.quality = "draft"
+    return settings
+
+
+@pytest.fixture
+def instant(monkeypatch):
+    """Make the pipeline instant: a material per region out of nothing but its mean colour."""
+    from material_palette.core import palette
+    from material_palette.core.material import SVBRDF
+
+    def extract_material(pixels, region, settings, progress):
+        progress(0.5, "half")
+        if not region.mask.any():
+            raise PaletteError(f"Region '{region.name}' is empty")
+        noise = np.random.default_rng(0).random((64, 64, 1), np.float32)
+        albedo = np.clip(pixels[region.mask].mean(0) * noise, 0, 1).astype(np.float32)
+        svbrdf = SVBRDF(albedo, np.array([0, 0, 1], np.float32), 0.6)
+        return palette.Material(region.name, "ok", svbrdf, preview=np.ones((256, 256, 4), np.float32))
+
+    monkeypatch.setattr(palette, "extract_material", extract_material)
+
+
+def test_open_photo_refuses_by_name(settings, tmp_path, data_blocks):
+    before = data_blocks()
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"not a picture")
+    assert "broken.png" in refused(bpy.ops.material_palette.open_photo, filepath=str(broken))
+    assert "nowhere.png" in refused(bpy.ops.material_palette.open_photo, filepath=str(tmp_path / "nowhere.png"))
+    assert settings.photo is None
+    assert data_blocks() == before
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_turned_photo_is_opened_upright(settings, tmp_path, orientation):
+    import OpenImageIO as oiio
+    from material_palette.core.image import read_photo
+    from material_palette.operators.photo import photo_reader, read_pixels
+
+    pixels = np.zeros((40, 64, 3), np.uint8)
+    pixels[:20, :32, 0] = 255
+    spec = oiio.ImageSpec(64, 40, 3, "uint8")
+    spec.attribute("Orientation", orientation)
+    path = str(tmp_path / "turned.tif")
+    output = oiio.ImageOutput.create(path)
+    output.open(path, spec)
+    output.write_image(pixels)
+    output.close()
+
+    bpy.ops.material_palette.open_photo(filepath=path)
+    upright = read_photo(path).pixels
+    np.testing.assert_allclose(read_pixels(settings.photo), upright, atol=0.01)
+    np.testing.assert_allclose(photo_reader(settings.photo)()[0], upright, atol=0.01)
+
+
+def test_painted_photo_is_read_from_blender_as_linear(settings):
+    from material_palette.operators.photo import photo_reader
+
+    image = bpy.data.images.new("painted", 4, 2)
+    pixels = np.ones((2, 4, 4), np.float32)
+    pixels[0, :, :3] = 128 / 255  # the bottom row
+    image.pixels.foreach_set(pixels.ravel())
+    linear, warnings = photo_reader(image)()
+    assert linear.shape == (2, 4, 3) and linear.dtype == np.float32
+    np.testing.assert_allclose(linear[0], 1.0)
+    np.testing.assert_allclose(linear[1], 0.21586, atol=1e-4)  # IEC 61966-2-1 of 128
+    assert warnings == []
+
+
+def test_float_photo_is_linear_already(settings):
+    from material_palette.operators.photo import photo_reader
+
+    image = bpy.data.images.new("radiance", 2, 2, float_buffer=True)
+    image.pixels.foreach_set(np.tile(np.array([0.5, 2.0, -0.1, 1.0], np.float32), 4))
+    np.testing.assert_allclose(photo_reader(image)()[0], np.tile([0.5, 2.0, 0.0], (2, 2, 1)))
+
+
+def test_imported_masks_go_out_as_they_came(ready, photo_and_masks, tmp_path):
+    from material_palette.core.image import read_mask
+
+    _photo, masks = photo_and_masks
+    assert [region.name for region in ready.regions] == ["left", "right"]
+    (tmp_path / "out").mkdir()
+    bpy.ops.material_palette.export_masks(directory=str(tmp_path / "out"))
+    for name in ("left.png", "right.png"):
+        assert (read_mask(tmp_path / "out" / name, (96, 160)) == read_mask(masks / name, (96, 160))).all()
+
+
+def test_importing_again_replaces_regions_of_the_same_name(ready, photo_and_masks, data_blocks):
+    before = data_blocks()
+    bpy.ops.material_palette.import_masks(directory=str(photo_and_masks[1]))
+    assert [region.name for region in ready.regions] == ["left", "right"]
+    assert data_blocks() == before
+
+
+def test_masks_survive_saving_and_loading(ready, tmp_path):
+    from material_palette.operators.regions import read_mask_image
+
+    bpy.ops.material_palette.add_region(name="painted")
+    image = ready.regions[2].mask
+    pixels = np.zeros(160 * 96 * 4, np.float32)
+    pixels[:400] = 1.0
+    image.pixels.foreach_set(pixels)
+    expected = [read_mask_image(region) for region in ready.regions]
+    assert expected[2].sum() == 100
+    path = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    regions = bpy.context.scene.material_palette.regions
+    for region, mask in zip(regions, expected, strict=True):
+        assert (read_mask_image(region) == mask).all()
+
+
+def test_removing_a_region_removes_its_mask(ready, data_blocks):
+    before = data_blocks()
+    bpy.ops.material_palette.add_region()
+    assert data_blocks() != before
+    bpy.ops.material_palette.remove_region()
+    assert data_blocks() == before
+
+
+def test_region_names_stay_apart(ready):
+    for _ in range(3):
+        bpy.ops.material_palette.add_region()
+    assert [region.name for region in ready.regions][2:] == ["Region", "Region 2", "Region 3"]
+
+
+def test_extract_makes_packed_materials_with_previews(ready, instant, temporary_folders):
+    assert bpy.ops.material_palette.extract() == {"FINISHED"}
+    assert [(entry.name, entry.material.name) for entry in ready.palette] == [("left", "left"), ("right", "right")]
+    for entry in ready.palette:
+        assert entry.material.asset_data is not None
+        assert entry.material.preview.is_image_custom
+        images = [node.image for node in entry.material.node_tree.nodes if node.bl_idname == "ShaderNodeTexImage"]
+        assert images and all(image.packed_file for image in images)
+    assert temporary_folders() == []
+    assert not bpy.context.window_manager.material_palette_run.running
+
+
+@pytest.mark.slow
+def test_extract_runs_the_real_pipeline(ready, temporary_folders):
+    assert bpy.ops.material_palette.extract() == {"FINISHED"}
+    assert [entry.material.name for entry in ready.palette] == ["left", "right"]
+    assert temporary_folders() == []
+
+
+def test_extract_leaves_out_regions_that_are_turned_off(ready, instant):
+    ready.regions[0].enabled = False
+    bpy.ops.material_palette.extract()
+    assert [entry.name for entry in ready.palette] == ["right"]
+
+
+def test_extract_into_a_folder(ready, instant, tmp_path):
+    ready.pack = False
+    assert "isn't saved" in refused(bpy.ops.material_palette.extract)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    settings = bpy.context.scene.material_palette
+    bpy.ops.material_palette.extract()
+    assert (tmp_path / "palette" / "palette.json").is_file()
+    image = next(n for n in settings.palette[0].material.node_tree.nodes if n.bl_idname == "ShaderNodeTexImage").image
+    assert image.filepath_raw == "//palette/left/left_basecolor.png"
+    assert image.packed_file is None and tuple(image.size) == (64, 64)
+    assert "isn't empty" in refused(bpy.ops.material_palette.extract)
+    settings.overwrite = True
+    assert bpy.ops.material_palette.extract() == {"FINISHED"}
+
+
+def test_extracting_again_keeps_used_materials_and_lets_unused_ones_go(ready, instant):
+    bpy.ops.material_palette.extract()
+    left, right = (entry.material for entry in ready.palette)
+    bpy.data.meshes.new("wall").materials.append(right)
+    bpy.ops.material_palette.extract()
+    assert [entry.material.name for entry in ready.palette] == ["left.001", "right.001"]
+    assert left.users == 0 and left.asset_data is None  # gone when the file is saved
+    assert right.users > 0 and right.asset_data is not None
+
+
+def test_one_bad_region_is_reported_and_the_others_are_kept(ready, instant, capfd):
+    bpy.ops.material_palette.add_region(name="sky")
+    assert bpy.ops.material_palette.extract() == {"FINISHED"}
+    assert [entry.name for entry in ready.palette] == ["left", "right"]
+    assert "'sky'" in capfd.readouterr().out
+
+
+def test_only_bad_regions_make_nothing(ready, instant, data_blocks, temporary_folders):
+    ready.regions[0].enabled = ready.regions[1].enabled = False
+    bpy.ops.material_palette.add_region(name="sky")
+    before = data_blocks()
+    assert "'sky'" in refused(bpy.ops.material_palette.extract)
+    assert data_blocks() == before
+    assert temporary_folders() == []
+    assert "'sky'" in bpy.context.window_manager.material_palette_run.error
+
+
+def test_refusals_name_what_is_wrong(ready):
+    ready.regions[0].name = "a/b"
+    ready.regions[1].name = "a_b"
+    assert "'a/b' and 'a_b'" in refused(bpy.ops.material_palette.extract)
+    ready.regions[1].name = "right"
+    ready.regions[1].mask.scale(80, 48)
+    message = refused(bpy.ops.material_palette.extract)
+    assert "'right'" in message and "80 x 48" in message and "160 x 96" in message
+    for region in ready.regions:
+        region.enabled = False
+    assert "No region" in refused(bpy.ops.material_palette.extract)
+    ready.photo = None
+    assert not bpy.ops.material_palette.extract.poll()
+
+
+def test_a_failed_run_leaves_nothing(ready, monkeypatch, data_blocks, temporary_folders):
+    from material_palette.core import palette
+
+    def extract_palette(*_arguments, **_keywords):
+        raise PaletteError("the disk is full")
+
+    monkeypatch.setattr(palette, "extract_palette", extract_palette)
+    before = data_blocks()
+    assert "the disk is full" in refused(bpy.ops.material_palette.extract)
+    assert data_blocks() == before
+    assert temporary_folders() == []
+    assert bpy.context.window_manager.material_palette_run.error == "the disk is full"
+
+
+def test_a_failing_build_leaves_nothing(ready, instant, monkeypatch, data_blocks, temporary_folders):
+    from material_palette.core import nodes
+
+    def mark_asset(material, description):
+        if material.name == "right":
+            raise PaletteError("no asset")
+
+    monkeypatch.setattr(nodes, "mark_asset", mark_asset)
+    before = data_blocks()
+    assert "no asset" in refused(bpy.ops.material_palette.extract)
+    assert data_blocks() == before
+    assert temporary_folders() == []
+
+
+class Endless:
+    """A pipeline that works until it is told to stop, and says when it has begun and ended."""
+
+    def __init__(self):
+        self.begun, self.ended = threading.Event(), threading.Event()
+
+    def __call__(self, pixels, regions, settings, progress, on_material=None, photo_name=""):
+        try:
+            while True:
+                progress(0.3, "working")
+                self.begun.set()
+                time.sleep(0.05)
+        finally:
+            self.ended.set()
+
+
+@pytest.fixture
+def endless(monkeypatch):
+    from material_palette.core import palette
+
+    pipeline = Endless()
+    monkeypatch.setattr(palette, "extract_palette", pipeline)
+    return pipeline
+
+
+class Modal:
+    """Stands for the operator in a window, which background mode doesn't have."""
+
+    bl_label = "Extract Palette"
+
+    def __init__(self):
+        self.reports = []
+
+    def report(self, kind, message):
+        self.reports.append(message)
+
+    def start(self):
+        from material_palette.operators.extract import MATERIAL_PALETTE_OT_extract as Extract
+
+        for name in ("prepare", "finish", "discard", "_start", "_drain", "_end", "_fail", "cancel"):
+            function = getattr(Extract, name)
+            setattr(self, name, function if name == "discard" else function.__get__(self))
+        assert self._start(bpy.context)
+        return self
+
+
+@pytest.fixture
+def running(ready, endless):
+    operator = Modal().start()
+    assert endless.begun.wait(20)
+    return operator
+
+
+def run_state():
+    return bpy.context.window_manager.material_palette_run
+
+
+def test_cancel_ends_within_half_a_second_and_leaves_nothing(running, endless, data_blocks, temporary_folders):
+    before = data_blocks()
+    assert run_state().running
+    assert run_state().message == "working"
+    assert not bpy.ops.material_palette.extract.poll()  # one run at a time
+    asked = time.monotonic()
+    assert bpy.ops.material_palette.cancel() == {"FINISHED"}
+    while (result := running._drain(bpy.context)) is None:
+        assert time.monotonic() - asked < 0.5
+        time.sleep(0.01)
+    assert result == {"CANCELLED"}
+    assert endless.ended.is_set()
+    assert not run_state().running
+    assert run_state().error == ""
+    assert data_blocks() == before
+    assert temporary_folders() == []
+
+
+def test_cancel_into_a_folder_leaves_no_folder(ready, endless, tmp_path):
+    ready.pack = False
+    ready.output_folder = str(tmp_path / "out")
+    files = sorted(tmp_path.rglob("*"))
+    operator = Modal().start()
+    assert endless.begun.wait(20)
+    bpy.ops.material_palette.cancel()
+    while operator._drain(bpy.context) is None:
+        time.sleep(0.01)
+    assert sorted(tmp_path.rglob("*")) == files
+
+
+def test_loading_another_file_stops_the_run(running, endless, tmp_path, temporary_folders):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert endless.ended.is_set()
+    assert not run_state().running
+    assert len(bpy.data.materials) == 0
+    assert temporary_folders() == []
+
+
+def test_disabling_the_extension_stops_the_run(running, endless, extension, temporary_folders):
+    extension.unregister()
+    try:
+        assert endless.ended.is_set()
+        assert temporary_folders() == []
+        assert not [thread for thread in threading.enumerate() if thread.name == "material_palette"]
+    finally:
+        extension.register()
+    assert not run_state().running
+
+
+def test_blender_taking_the_operator_away_stops_the_run(running, endless, temporary_folders):
+    running.cancel(bpy.context)
+    assert endless.ended.is_set()
+    assert temporary_folders() == []
+    assert not run_state().running
+
+
+def test_a_result_for_a_removed_scene_is_thrown_away(ready, instant, data_blocks, temporary_folders):
+    operator = Modal().start()
+    scene = bpy.context.scene
+    bpy.context.window.scene = bpy.data.scenes.new("other")
+    bpy.data.scenes.remove(scene)
+    before = data_blocks()
+    while (result := operator._drain(bpy.context)) is None:
+        time.sleep(0.01)
+    assert result == {"CANCELLED"}
+    assert "scene" in operator.reports[-1]
+    assert data_blocks() == before
+    assert temporary_folders() == []
+
+
+def test_segment_replaces_what_it_found_before_and_keeps_the_rest(ready):
+    ready.auto_regions = 3
+    assert bpy.ops.material_palette.segment() == {"FINISHED"}
+    found = [region.name for region in ready.regions][2:]
+    assert [region.name for region in ready.regions][:2] == ["left", "right"]
+    assert 1 <= len(found) <= 3
+    assert all(tuple(region.mask.size) == (160, 96) for region in ready.regions)
+    assert bpy.ops.material_palette.segment() == {"FINISHED"}
+    assert [region.name for region in ready.regions] == ["left", "right", *found]
+
+
+def add_object(name, content):
+    obj = bpy.data.objects.new(name, content)
+    bpy.context.collection.objects.link(obj)
+    obj.select_set(True)
+    return obj
+
+
+@pytest.fixture
+def palette(settings):
+    """A palette of one material that needs no photo."""
+    entry = settings.palette.add()
+    entry.name = "stone"
+    entry.material = bpy.data.materials.new("stone")
+    if entry.material.node_tree is None:
+        entry.material.use_nodes = True
+    return settings
+
+
+def test_assign_gives_every_selected_object_the_material(palette, capfd):
+    mesh = bpy.data.meshes.new("wall")
+    wall, curve = add_object("wall", mesh), add_object("path", bpy.data.curves.new("path", "CURVE"))
+    light = add_object("sun", bpy.data.lights.new("sun", "SUN"))
+    other = add_object("floor", bpy.data.meshes.new("floor"))
+    other.select_set(False)
+    assert bpy.ops.material_palette.assign() == {"FINISHED"}
+    assert wall.active_material == curve.active_material == palette.palette[0].material
+    assert other.active_material is None
+    assert "'sun' can't hold a material" in capfd.readouterr().out
+    assert light.data is not None
+
+
+def test_assign_replaces_the_active_slot_only(palette):
+    mesh = bpy.data.meshes.new("wall")
+    old = [bpy.data.materials.new(name) for name in ("a", "b")]
+    for material in old:
+        mesh.materials.append(material)
+    wall = add_object("wall", mesh)
+    wall.active_material_index = 1
+    bpy.ops.material_palette.assign()
+    assert list(mesh.materials) == [old[0], palette.palette[0].material]
+
+
+def test_assign_says_when_a_texture_can_not_be_seen(palette, capfd):
+    palette.palette[0].material.node_tree.nodes.new("ShaderNodeTexImage")
+    add_object("wall", bpy.data.meshes.new("wall"))
+    bpy.ops.material_palette.assign()
+    assert "'wall' has no UV map" in capfd.readouterr().out
+
+
+def test_assign_refuses_with_the_reason(palette):
+    assert "No object is selected" in refused(bpy.ops.material_palette.assign)
+    light = add_object("sun", bpy.data.lights.new("sun", "SUN"))
+    assert "'sun' can't hold a material" in refused(bpy.ops.material_palette.assign)
+    bpy.data.objects.remove(light)
+    add_object("wall", bpy.data.meshes.new("wall"))
+    bpy.data.materials.remove(palette.palette[0].material)
+    assert "'stone' was deleted" in refused(bpy.ops.material_palette.assign)
+    palette.palette.clear()
+    assert not bpy.ops.material_palette.assign.poll()
+
+
+def test_undo_takes_a_palette_back_in_one_step(ready, instant):
+    bpy.context.preferences.edit.use_global_undo = True
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.material_palette.extract()
+    bpy.ops.ed.undo_push(message="Extract Palette")  # background mode pushes none by itself
+    assert len(bpy.data.materials) == 2
+    bpy.ops.ed.undo()
+    assert len(bpy.data.materials) == 0
+    assert len(bpy.context.scene.material_palette.palette) == 0
+    assert len(bpy.context.scene.material_palette.regions) == 2
+    bpy.ops.ed.redo()
+    assert len(bpy.context.scene.material_palette.palette) == 2
+    assert Path(bpy.app.tempdir).is_dir()

@@ -1,0 +1,100 @@
+"""Enabling adds the extension's parts, disabling leaves nothing of them."""
+
+import gc
+import sys
+
+import bpy
+import pytest
+
+HANDLERS = [name for name in dir(bpy.app.handlers) if isinstance(getattr(bpy.app.handlers, name), list)]
+
+
+def registered():
+    """Everything that an extension can leave behind, by place."""
+    found = {
+        "types": set(dir(bpy.types)),
+        "scene": set(bpy.types.Scene.bl_rna.properties.keys()),
+        "window manager": set(bpy.types.WindowManager.bl_rna.properties.keys()),
+        "image": set(bpy.types.Image.bl_rna.properties.keys()),
+        "material": set(bpy.types.Material.bl_rna.properties.keys()),
+        "operators": {f"{module}.{name}" for module in dir(bpy.ops) for name in dir(getattr(bpy.ops, module))},
+    }
+    for name in HANDLERS:
+        found[name] = list(getattr(bpy.app.handlers, name))
+    for menu in (bpy.types.TOPBAR_MT_editor_menus, bpy.types.STATUSBAR_HT_header, bpy.types.NODE_MT_context_menu):
+        found[menu.__name__] = list(getattr(menu.draw, "_draw_funcs", ()))
+    return found
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_disabling_leaves_nothing(times):
+    package = sys.modules["material_palette"]
+    before = registered()
+    for _ in range(times):
+        package.register()
+        package.unregister()
+    gc.collect()
+    assert registered() == before
+    assert not hasattr(bpy.types.Scene, "material_palette")
+    assert not hasattr(bpy.types.WindowManager, "material_palette_run")
+
+
+def test_disabling_takes_the_command_back(monkeypatch):
+    package = sys.modules["material_palette"]
+    commands = {}
+
+    def register(name, execute):
+        commands[handle := object()] = name
+        return handle
+
+    monkeypatch.setattr(bpy.utils, "register_cli_command", register)
+    monkeypatch.setattr(bpy.utils, "unregister_cli_command", commands.pop)
+    package.register()
+    assert list(commands.values()) == ["material_palette"]
+    package.unregister()
+    assert commands == {}
+
+
+def test_enabling_adds_operators_panels_and_settings(extension):
+    operators = {name for name in dir(bpy.ops.material_palette) if not name.startswith("_")}
+    assert operators == {
+        "add_region",
+        "assign",
+        "cancel",
+        "copy_install_command",
+        "export_masks",
+        "extract",
+        "import_masks",
+        "open_photo",
+        "paint_region",
+        "remove_region",
+        "segment",
+        "show_photo",
+    }
+    panels = {name for name in dir(bpy.types) if name.startswith("MATERIAL_PALETTE_PT_")}
+    assert panels == {
+        f"MATERIAL_PALETTE_PT_{section}_{space}"
+        for section in ("photo", "regions", "extract", "palette")
+        for space in ("image_editor", "view_3d")
+    }
+    assert bpy.context.scene.material_palette.resolution == 1024
+    assert not bpy.context.window_manager.material_palette_run.running
+
+
+def test_choices_are_those_of_the_pipeline(extension):
+    from material_palette import properties
+    from material_palette.core import palette
+
+    assert tuple(identifier for identifier, *_ in properties.QUALITIES) == tuple(palette.QUALITIES)
+    assert tuple(properties.RESOLUTION_RANGE) == tuple(palette.RESOLUTION_RANGE)
+
+
+def test_a_scene_keeps_its_settings_in_the_file(settings, tmp_path):
+    settings.resolution = 2048
+    settings.quality = "best"
+    path = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    settings = bpy.context.scene.material_palette
+    assert (settings.resolution, settings.quality) == (2048, "best")

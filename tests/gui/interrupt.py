@@ -1,0 +1,116 @@
+"""Runs inside Blender's window: a run while the user undoes, opens another file or disables the extension.
+
+Environment: PALETTE_PHOTO, PALETTE_MASKS, PALETTE_STATE (JSON, written at the end: "error" is null or a traceback).
+"""
+
+import json
+import os
+import threading
+import time
+import traceback
+
+import blender_gui
+import bpy
+
+NAME = "bl_ext.user_default.material_palette"
+STATE = os.environ["PALETTE_STATE"]
+
+
+def in_view():
+    area = blender_gui.find_area("VIEW_3D")
+    return bpy.context.temp_override(
+        window=blender_gui.window(), area=area, region=next(r for r in area.regions if r.type == "WINDOW")
+    )
+
+
+def run():
+    return bpy.context.window_manager.material_palette_run
+
+
+def begin():
+    """Open the example, begin to extract it and wait until the work is on its way."""
+    with in_view():
+        bpy.ops.material_palette.open_photo(filepath=os.environ["PALETTE_PHOTO"])
+        bpy.ops.material_palette.import_masks(directory=os.environ["PALETTE_MASKS"])
+        settings = bpy.context.scene.material_palette
+        settings.quality, settings.resolution = "draft", 64
+        for region in list(settings.regions)[1:]:
+            region.enabled = False
+        bpy.ops.ed.undo_push(message="Set up")
+        bpy.data.objects["Cube"].location.x = 1.0
+        bpy.ops.ed.undo_push(message="Move")
+        assert bpy.ops.material_palette.extract("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield from wait(lambda: run().progress > 0, 60)
+
+
+def wait(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "too late"
+        yield
+
+
+def pause(seconds):
+    end = time.monotonic() + seconds
+    yield from wait(lambda: time.monotonic() > end, seconds + 60)
+
+
+def assert_nothing_left():
+    assert not [thread for thread in threading.enumerate() if thread.name == "material_palette"]
+    assert not [name for name in os.listdir(bpy.app.tempdir) if name.startswith("material_palette_")]
+
+
+def story():
+    yield from begin()
+    before = len(bpy.data.materials)
+    with in_view():
+        bpy.ops.ed.undo()
+    assert bpy.data.objects["Cube"].location.x == 0.0
+    assert run().running
+    yield from wait(lambda: not run().running, 300)
+    assert run().error == ""
+    assert len(bpy.data.materials) == before + 1
+    assert len(bpy.context.scene.material_palette.palette) == 1
+    assert_nothing_left()
+
+    yield from begin()
+    bpy.ops.wm.read_homefile(app_template="")
+    yield
+    assert not run().running
+    assert not bpy.context.scene.material_palette.palette
+    assert_nothing_left()
+
+    yield from begin()
+    bpy.ops.preferences.addon_disable(module=NAME)
+    yield
+    assert not hasattr(bpy.types.Scene, "material_palette")
+    assert_nothing_left()
+    before = len(bpy.data.materials)
+    bpy.ops.preferences.addon_enable(module=NAME)
+    yield from pause(3)
+    assert not run().running
+    assert len(bpy.data.materials) == before
+
+    # and after all that it still works
+    yield from begin()
+    yield from wait(lambda: not run().running, 300)
+    assert len(bpy.context.scene.material_palette.palette) == 1
+
+
+def play(scene=story()):  # noqa: B008, one story per run of the script
+    error = None
+    try:
+        next(scene)
+        return 0.2
+    except StopIteration:
+        pass
+    except Exception:
+        error = traceback.format_exc()
+    with open(STATE + ".part", "w", encoding="utf-8") as file:
+        json.dump({"error": error}, file)
+    os.replace(STATE + ".part", STATE)
+    return None
+
+
+blender_gui.show_tab("VIEW_3D", "Palette")
+blender_gui.step(lambda: bpy.app.timers.register(play, persistent=True))

@@ -1,0 +1,21 @@
+#!/bin/bash
+# The extension in a real Blender window: the example photo, real clicks, what the data holds afterwards, screenshots.
+#
+#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [extract_palette|interrupt]
+#
+# The story is a pair of files here: NAME.py runs in Blender, NAME.sh drives the window from outside.
+# extract_palette, the default, also writes OUT-start.png, OUT-running.png and OUT-palette.png.
+# Exit code 0 when all went as expected. PALETTE_EXAMPLE: another folder with photo.jpg and masks/.
+set -euo pipefail
+here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
+if [ $# -lt 2 ]; then sed -n '2,8s/^# \{0,1\}//p' "$0" >&2; exit 2; fi
+: "${BLENDER_GUI:?the path of blender_gui.sh}"
+
+name=${3:-extract_palette}
+example=${PALETTE_EXAMPLE:-$(cd "$here/../../examples/facade" && pwd)}
+mkdir -p "$(dirname "$2")"
+out=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")
+export PALETTE_PHOTO="$example/photo.jpg" PALETTE_MASKS="$example/masks" PALETTE_SHOT=$out PALETTE_STATE="$out.state.json"
+rm -f "$PALETTE_STATE"
+export BGUI_PASS="PALETTE_PHOTO PALETTE_MASKS PALETTE_STATE" BGUI_SHARE="$here:$example:$(dirname "$out")"
+GUI_DRIVE="$here/$name.sh" exec "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out"

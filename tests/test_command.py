@@ -1,0 +1,151 @@
+"""The command line on bad and on partly bad input; needs bpy, for palette.blend."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from textures import pebbles
+
+pytest.importorskip("bpy", reason="palette.blend is written by Blender")
+from material_palette.core.command import main  # noqa: E402
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    """A folder with photo.png, masks/a.png, masks/b.png."""
+    photo = pebbles(120, 200)
+    photo[:, 110:] = photo[:, 110:, ::-1]
+    cv2.imwrite(str(tmp_path / "photo.png"), np.rint(photo * 255).astype(np.uint8))
+    (tmp_path / "masks").mkdir()
+    for name, columns in {"a": slice(4, 100), "b": slice(112, 196)}.items():
+        mask = np.zeros((120, 200), np.uint8)
+        mask[4:116, columns] = 255
+        cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), mask)
+    return tmp_path
+
+
+def extract(folder, *more, photo="photo.png", masks="masks", out="out"):
+    where = ["--masks", str(folder / masks)] if masks else []
+    settings = ["--resolution", "96", "--quality", "draft"]
+    return main(["extract", str(folder / photo), *where, *settings, *more, "-o", str(folder / out)])
+
+
+def bad_mask(folder, pixels, name="a.png"):
+    cv2.imwrite(str(folder / "masks" / name), pixels)
+
+
+def test_a_palette_is_written(inputs, capsys):
+    assert extract(inputs) == 0
+    out = inputs / "out"
+    names = {p.name for p in out.iterdir()}
+    assert {"palette.blend", "palette.json", "palette.png", "masks", "a", "b"} <= names
+    content = json.loads((out / "palette.json").read_text(encoding="utf-8"))
+    assert [m["status"] for m in content["materials"]] == ["ok", "ok"]
+    assert (out / "palette.blend").stat().st_size > 10_000
+    # the masks that were used can be passed back
+    assert extract(inputs, masks="out/masks", out="again") == 0
+    assert (inputs / "again/a/a_basecolor.png").read_bytes() == (out / "a/a_basecolor.png").read_bytes()
+
+
+def spoil(name):
+    """What each case does to the inputs, and the arguments and words of the error that go with it."""
+
+    def photo(content):
+        return lambda f: (f / "photo.png").write_bytes(content)
+
+    def truncate(f):
+        whole = (f / "photo.png").read_bytes()
+        (f / "photo.png").write_bytes(whole[: len(whole) // 2])
+
+    def two_of_one_name(f):
+        cv2.imwrite(str(f / "masks" / "a.tif"), np.full((120, 200), 255, np.uint8))
+
+    def existing_output(f):
+        (f / "out").mkdir()
+        (f / "out" / "mine.txt").write_text("mine")
+
+    nothing = lambda f: None  # noqa: E731
+    return {
+        "missing photo": (lambda f: (f / "photo.png").unlink(), {}, "photo.png"),
+        "empty photo": (photo(b""), {}, "photo.png"),
+        "no image": (photo(b"this is no image at all" * 50), {}, "photo.png"),
+        "truncated photo": (truncate, {}, "photo.png"),
+        "one pixel": (lambda f: cv2.imwrite(str(f / "photo.png"), np.zeros((1, 1, 3), np.uint8)), {}, "1 x 1"),
+        "missing masks": (nothing, {"masks": "nowhere"}, "nowhere"),
+        "no masks": (lambda f: [p.unlink() for p in (f / "masks").iterdir()], {}, "masks"),
+        "mask of another shape": (lambda f: bad_mask(f, np.full((50, 200), 255, np.uint8)), {}, "a.png"),
+        "two masks of one name": (two_of_one_name, {}, "a.tif"),
+        "resolution 0": (nothing, {"more": ["--resolution", "0"]}, "resolution 0"),
+        "huge resolution": (nothing, {"more": ["--resolution", "100000"]}, "8192"),
+        "unknown engine": (nothing, {"more": ["--engine", "magic"]}, "engine 'magic'"),
+        "unknown segmenter": (nothing, {"masks": None, "more": ["--segment", "magic"]}, "magic"),
+        "no regions asked": (nothing, {"masks": None}, "--masks"),
+        "existing output": (existing_output, {}, "--overwrite"),
+    }[name]
+
+
+CASES = [
+    "missing photo",
+    "empty photo",
+    "no image",
+    "truncated photo",
+    "one pixel",
+    "missing masks",
+    "no masks",
+    "mask of another shape",
+    "two masks of one name",
+    "resolution 0",
+    "huge resolution",
+    "unknown engine",
+    "unknown segmenter",
+    "no regions asked",
+    "existing output",
+]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bad_input_is_named_and_nothing_is_written(inputs, capfd, name):
+    change, how, said = spoil(name)
+    change(inputs)
+    before = sorted(p for p in inputs.rglob("*"))
+    assert extract(inputs, *how.get("more", []), masks=how.get("masks", "masks")) == 2
+    error = capfd.readouterr().err
+    assert said in error and "Traceback" not in error
+    assert sorted(p for p in inputs.rglob("*")) == before
+
+
+@pytest.mark.parametrize("pixels", [np.zeros((120, 200), np.uint8), np.pad(np.full((8, 8), 255, np.uint8), 10)])
+def test_one_bad_region_gives_code_3_and_the_others(inputs, capfd, pixels):
+    bad_mask(inputs, cv2.copyMakeBorder(pixels, 0, 120 - len(pixels), 0, 200 - len(pixels[0]), cv2.BORDER_CONSTANT))
+    assert extract(inputs) == 3
+    content = json.loads((inputs / "out" / "palette.json").read_text(encoding="utf-8"))
+    assert [m["status"] for m in content["materials"]] == ["failed", "ok"]
+    assert "'a'" in content["materials"][0]["error"]
+    assert (inputs / "out" / "b" / "b_basecolor.png").exists() and not (inputs / "out" / "a").exists()
+
+
+def test_overwrite_replaces_the_palette_and_nothing_else(inputs):
+    assert extract(inputs) == 0
+    (inputs / "out" / "notes.txt").write_text("mine")
+    (inputs / "masks" / "b.png").unlink()
+    assert extract(inputs) == 2
+    assert extract(inputs, "--overwrite", "--seed", "5") == 0
+    assert (inputs / "out" / "notes.txt").read_text() == "mine"
+    assert not (inputs / "out" / "b").exists()
+
+
+def test_regions_are_found_without_masks(inputs):
+    assert extract(inputs, "--segment", "auto", "--regions", "3", masks=None) == 0
+    content = json.loads((inputs / "out" / "palette.json").read_text(encoding="utf-8"))
+    assert 1 <= len(content["materials"]) <= 3
+
+
+def test_several_photos_make_a_folder_each_and_a_bad_one_does_not_stop_the_rest(inputs, capfd):
+    (inputs / "masks2" / "photo").mkdir(parents=True)
+    (inputs / "masks" / "a.png").rename(inputs / "masks2" / "photo" / "a.png")
+    (inputs / "broken.png").write_bytes(b"no image")
+    code = extract(inputs, str(inputs / "broken.png"), masks="masks2")
+    assert code == 2 and "broken.png" in capfd.readouterr().err
+    assert (inputs / "out" / "photo" / "palette.blend").exists()
+    assert not (inputs / "out" / "broken").exists()

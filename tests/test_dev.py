@@ -1,0 +1,200 @@
+"""dev.py says why it can't go on, makes its environment once, and makes it anew after an interruption."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import dev
+
+posix = pytest.mark.skipif(os.name != "posix", reason="signals and scripts of POSIX")
+
+
+@pytest.fixture
+def clone(tmp_path, monkeypatch):
+    """dev.py in an empty folder, run from outside its environment; setting up costs nothing.
+
+    `.made` lists the environments made, `.became` the commands that dev.py handed over to."""
+    requirements = tmp_path / "requirements.txt"
+    requirements.write_text("one==1\n")
+    clone = SimpleNamespace(root=tmp_path, requirements=requirements, venv=tmp_path / ".venv", made=[], became=[])
+
+    def make_venv():
+        python = Path(dev.venv_python(dev.VENV))
+        python.parent.mkdir(parents=True)
+        python.touch()
+        (clone.venv / "pyvenv.cfg").touch()
+        clone.made.append(dev.VENV)
+
+    monkeypatch.setattr(dev, "ROOT", str(tmp_path))
+    monkeypatch.setattr(dev, "VENV", str(clone.venv))
+    monkeypatch.setattr(dev, "REQUIREMENTS", str(requirements))
+    monkeypatch.setattr(dev, "PYTHONS", (sys.version_info[:2],))
+    monkeypatch.setattr(dev, "make_venv", make_venv)
+    monkeypatch.setattr(dev, "pip", lambda arguments: (0, []))
+    monkeypatch.setattr(dev, "check_imports", lambda: None)
+    monkeypatch.setattr(dev, "hand_over", lambda command: clone.became.append(command) or 0)
+    return clone
+
+
+def test_environment_is_made_once_and_the_command_handed_over(clone):
+    assert dev.main(["test", "-x"]) == 0
+    assert dev.main(["demo"]) == 0
+    assert len(clone.made) == 1
+    assert clone.became[0] == [dev.venv_python(str(clone.venv)), os.path.abspath(dev.__file__), "test", "-x"]
+
+
+@pytest.mark.parametrize("change", ["requirements", "python"])
+def test_environment_is_made_anew_when_it_no_longer_fits(clone, monkeypatch, change):
+    dev.main(["demo"])
+    if change == "requirements":
+        clone.requirements.write_text("one==2\n")
+    else:
+        other = {**dev.stamp(), "python": "3.99"}
+        monkeypatch.setattr(dev, "stamp", lambda: other)
+    leftover = clone.venv / "leftover"
+    leftover.touch()
+    dev.main(["demo"])
+    assert len(clone.made) == 2 and not leftover.exists()
+
+
+def test_interrupted_set_up_ends_with_130_and_is_done_again(clone, monkeypatch):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "pip", interrupted)
+        assert dev.main(["demo"]) == 130
+    assert not dev.is_ready() and not clone.became
+    assert dev.main(["demo"]) == 0
+    assert len(clone.made) == 2 and dev.is_ready()
+
+
+def test_a_folder_that_is_no_environment_is_never_removed(clone, capsys):
+    clone.venv.mkdir()
+    precious = clone.venv / "thesis.tex"
+    precious.touch()
+    assert dev.main(["demo"]) == 1
+    assert precious.exists() and "move it away" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("argv, code", [([], 2), (["--help"], 0), (["dmeo"], 2)])
+def test_usage_costs_no_environment(clone, capsys, argv, code):
+    assert dev.main(argv) == code
+    assert "dev.py demo" in capsys.readouterr().out and not clone.made
+
+
+def test_wrong_python_names_the_right_ones_and_the_one_found(clone, monkeypatch, capsys):
+    monkeypatch.setattr(dev, "PYTHONS", ((9, 1), (9, 3)))
+    assert dev.main(["demo"]) == 1
+    said = capsys.readouterr().err
+    assert "9.1 or 9.3" in said and "{}.{}".format(*sys.version_info) in said and sys.executable in said
+    assert not clone.made
+
+
+@posix
+def test_wrong_python_gives_way_to_a_right_one_that_really_runs(clone, monkeypatch):
+    """A version manager's shim answers to the name of a Python that isn't there; it must not be believed."""
+    folder = clone.root / "bin"
+    folder.mkdir()
+    for name, script in {"python9.1": "exit 127", "python9.3": "echo 9 3"}.items():
+        (folder / name).write_text(f"#!/bin/sh\n{script}\n")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
+    monkeypatch.setattr(dev, "PYTHONS", ((9, 1), (9, 3)))
+    assert dev.main(["test", "-k", "torus"]) == 0
+    assert clone.became == [[str(folder / "python9.3"), os.path.abspath(dev.__file__), "test", "-k", "torus"]]
+    assert not clone.made
+
+
+def test_too_little_disk_is_told_before_anything_is_made(clone, monkeypatch, capsys):
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1.2e9))
+    assert dev.main(["demo"]) == 1
+    said = capsys.readouterr().err
+    assert "1.2 GB are free" in said and "needs 4 GB" in said and "PIP_FIND_LINKS" in said
+    assert not clone.made
+
+
+# what pip really prints, abridged
+NO_NETWORK = """\
+WARNING: Retrying (Retry(total=0, connect=None)) after connection broken by 'NewConnectionError('<pip._vendor.urllib3.\
+connection.HTTPSConnection object at 0x7f9b>: Failed to establish a new connection: [Errno 111] Connection refused')'
+ERROR: Could not find a version that satisfies the requirement bpy==5.0.1 (from versions: none)
+ERROR: No matching distribution found for bpy==5.0.1
+"""
+NO_BUILD = """\
+ERROR: Could not find a version that satisfies the requirement bpy==5.0.1 (from versions: none)
+ERROR: No matching distribution found for bpy==5.0.1
+"""
+NO_DISK = "ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device\n"
+NO_TRUST = "SSLError(SSLCertVerificationError(1, '[SSL: CERTIFICATE_VERIFY_FAILED] certificate verify failed'))\n"
+OTHER = "ERROR: Hash mismatch of one-1.whl\n"
+
+
+@pytest.mark.parametrize(
+    "output, reason",
+    [
+        (NO_NETWORK, "no network"),
+        (NO_BUILD, "finds no bpy==5.0.1 for this computer"),
+        (NO_DISK, "disk is full"),
+        (NO_TRUST, "PIP_CERT"),
+        (OTHER, "Hash mismatch of one-1.whl"),
+    ],
+)
+def test_failure_of_pip_gives_its_reason(clone, monkeypatch, capsys, output, reason):
+    monkeypatch.setattr(dev, "pip", lambda arguments: (1, output.splitlines(keepends=True)))
+    assert dev.main(["demo"]) == 1
+    assert reason in capsys.readouterr().err
+    assert not dev.is_ready() and (clone.venv / "pip.log").read_text() == output
+
+
+def test_missing_system_libraries_are_named_with_their_packages():
+    output = "ImportError: libXi.so.6: cannot open shared object file: No such file or directory"
+    said = dev.import_failure(output, {"libSM.so.6"})
+    assert "libSM.so.6, libXi.so.6" in said and "apt install libsm6 libxi6" in said
+
+
+def test_python_of_an_environment_on_either_kind_of_system():
+    assert dev.venv_python("e", windows=True).replace("\\", "/") == "e/Scripts/python.exe"
+    assert dev.venv_python("e", windows=False).replace("\\", "/") == "e/bin/python"
+
+
+def test_exit_code_is_the_programs(tmp_path):
+    code = "import dev, sys; sys.exit(dev.hand_over([sys.executable, '-c', 'raise SystemExit(3)']))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=Path(dev.__file__).parent).returncode == 3
+
+
+@posix
+def test_ctrl_c_ends_a_command_with_130():
+    code = (
+        "import dev, sys, time\n"
+        "dev.VENV, dev.is_ready = sys.prefix, lambda: True\n"
+        "dev.COMMANDS['demo'] = lambda arguments: print('runs', flush=True) or time.sleep(60)\n"
+        "sys.exit(dev.main(['demo']))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=Path(dev.__file__).parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell in the background of CI starts its children with SIGINT ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        assert process.stdout.readline() == "runs\n"
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=20)[1]
+    assert process.returncode == 130
+    assert "Traceback" not in said
+
+
+def test_the_root_is_loaded_under_one_name_only():
+    """The root is a package; pytest must not import it a second time under the clone's folder name."""
+    root_init = Path(dev.__file__).with_name("__init__.py")
+    names = [n for n, m in list(sys.modules.items()) if getattr(m, "__file__", None) == str(root_init)]
+    assert names == ["material_palette"]

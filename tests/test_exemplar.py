@@ -1,0 +1,76 @@
+import cv2
+import numpy as np
+import pytest
+from material_palette.core.exemplar import cut_exemplar
+from material_palette.core.image import linear_from_srgb
+from textures import pebbles
+
+
+def full(pixels):
+    return np.ones(pixels.shape[:2], bool)
+
+
+def test_a_ramp_of_light_is_taken_out_and_the_texture_kept():
+    flat = linear_from_srgb(0.2 + 0.6 * pebbles(200, 200))
+    ramp = np.linspace(1.0, 0.3, 200, dtype=np.float32)[None, :, None]
+    found = cut_exemplar(flat * ramp, full(flat)).pixels
+
+    def halves(x):
+        return x[:, :60].mean() / x[:, -60:].mean()
+
+    assert halves(flat * ramp) > 1.8
+    assert abs(halves(found) / halves(flat) - 1) < 0.12
+    # contrast of the pebbles themselves, on the logarithm
+    fine = [np.log(x[..., 1]) - cv2.GaussianBlur(np.log(x[..., 1]), (0, 0), 12) for x in (flat, found)]
+    assert abs(fine[1].std() / fine[0].std() - 1) < 0.05
+
+
+def test_what_lies_outside_the_region_does_not_change_the_result():
+    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(120, 160))
+    mask = np.zeros((120, 160), bool)
+    mask[20:100, 30:130] = True
+    cv2.circle(mask.view(np.uint8), (80, 60), 20, 0, -1)
+    other = pixels.copy()
+    other[~mask] = (5.0, 0.0, 0.0)
+    one, two = cut_exemplar(pixels, mask), cut_exemplar(other, mask)
+    assert one.pixels.shape == (80, 100, 3)
+    assert np.allclose(one.pixels[one.mask], two.pixels[two.mask], rtol=1e-4)
+
+
+def test_without_flattening_the_photo_is_kept():
+    pixels = linear_from_srgb(pebbles(80, 80))
+    exemplar = cut_exemplar(pixels, full(pixels), flatten=False)
+    assert np.array_equal(exemplar.pixels, pixels)
+
+
+@pytest.mark.parametrize("noise", [0.0, 4.0])
+def test_a_wall_of_one_colour_under_uneven_light_and_noise_is_uniform(noise):
+    random = np.random.default_rng(1)
+    colour = np.array([0.42, 0.2, 0.1], np.float32)
+    light = np.linspace(0.8, 1.25, 150, dtype=np.float32)[:, None, None]
+    encoded = np.clip(np.broadcast_to(colour * light, (150, 150, 3)), 0, 1) ** (1 / 2.2)
+    noisy = np.rint(255 * encoded + noise * random.standard_normal(encoded.shape)) / 255
+    uniform = cut_exemplar(linear_from_srgb(noisy), full(noisy)).uniform
+    assert uniform is not None
+    assert np.allclose(uniform, linear_from_srgb(colour ** (1 / 2.2)), rtol=0.08)
+
+
+@pytest.mark.parametrize("contrast", [0.06, 1.0])
+def test_a_texture_is_not_uniform(contrast):
+    pixels = linear_from_srgb(0.4 + contrast * (pebbles(150, 150) - 0.4))
+    assert cut_exemplar(pixels, full(pixels)).uniform is None
+
+
+def test_over_exposure_is_said():
+    pixels = linear_from_srgb(pebbles(100, 100))
+    pixels[:20] = 1.0
+    assert any("over-exposed" in warning for warning in cut_exemplar(pixels, full(pixels)).warnings)
+
+
+def test_of_a_huge_region_the_fullest_part_is_cut_and_said():
+    mask = np.zeros((1700, 3200), bool)
+    mask[:, ::50] = True
+    mask[100:1690, 1600:3150] = True
+    exemplar = cut_exemplar(np.full((1700, 3200, 3), 0.4, np.float32), mask)
+    assert exemplar.mask.shape == (1536, 1536) and exemplar.mask.all()
+    assert any("3151 x 1700" in warning for warning in exemplar.warnings)
