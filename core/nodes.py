@@ -173,9 +173,7 @@ def _wire_textures(tree, principled, textures, metres_per_tile):
     mapping = _node(tree, "ShaderNodeMapping", "mapping", 0, "Scale of all maps")
     mapping.inputs["Scale"].default_value = (1.0 / metres_per_tile,) * 3
     tree.links.new(coordinate.outputs["UV"], mapping.inputs["Vector"])
-    frames = [
-        _frame(tree, f"One tile is {metres_per_tile:g} m", (coordinate, mapping)),
-    ]
+    _frame(tree, f"One tile is {metres_per_tile:g} m", (coordinate, mapping))
     nodes = []
     for row, role in enumerate(role for role in _LABELS if role in textures):
         node = _node(tree, "ShaderNodeTexImage", "image", row, _LABELS[role])
@@ -191,14 +189,14 @@ def _wire_textures(tree, principled, textures, metres_per_tile):
             tree.links.new(node.outputs["Color"], bend.inputs["Color"])
             tree.links.new(bend.outputs["Normal"], principled.inputs["Normal"])
             nodes.append(bend)
-    frames.append(_frame(tree, "Maps", nodes))
-    return frames
+    _frame(tree, "Maps", nodes)
 
 
 def _node(tree, idname, column, row, label=""):
     node = tree.nodes.new(idname)
     node.location = (_COLUMN[column], -row * _ROW)
     node.label = label
+    node.select = False
     return node
 
 
@@ -207,7 +205,7 @@ def _frame(tree, label, nodes):
     frame.label = label
     for node in nodes:
         node.parent = frame
-    return frame
+    frame.select = False
 
 
 def _keep_height(material, record, folder, pack, images):

@@ -21,7 +21,7 @@ from material_palette.core.command import main  # noqa: E402
 
 SHEETS = {"viaduct": "demo", "facade": "facade"}
 SHOWN = [("viaduct", "masonry"), ("viaduct", "rubble"), ("facade", "stone_wall"), ("facade", "red_wood")]
-REPEATS = 1.5  # of the tile along a cube's side
+REPEATS = 1.0  # of the tile along a wall
 
 
 def extract(example: str) -> Path:
@@ -39,7 +39,7 @@ def save(picture, path: Path, width: int) -> None:
 
 
 def build_scene(folders: dict[str, Path]) -> None:
-    """A sphere and a cube of each material on a grey floor, under a sun and a sky."""
+    """A sphere and a wall of each material on a grey floor, under a sun and a sky."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     for example, folder in folders.items():
@@ -50,7 +50,7 @@ def build_scene(folders: dict[str, Path]) -> None:
         x = (i - (len(SHOWN) - 1) / 2) * 2.4
         material = bpy.data.materials[name]
         bpy.ops.mesh.primitive_uv_sphere_add(segments=96, ring_count=48, radius=0.95, location=(x, 0, 0.95))
-        place(bpy.context.object, material, 3, 1.5)
+        place(bpy.context.object, material, 2, 1)
         bpy.ops.object.shade_smooth()
         bpy.ops.mesh.primitive_plane_add(size=2.3, location=(x, 1.6, 1.15), rotation=(1.5708, 0, 0))
         place(bpy.context.object, material, REPEATS, REPEATS)
@@ -58,16 +58,16 @@ def build_scene(folders: dict[str, Path]) -> None:
     grey = bpy.data.materials.new("floor")
     grey.diffuse_color = (0.2, 0.2, 0.2, 1)
     bpy.context.object.data.materials.append(grey)
-    bpy.ops.object.light_add(type="SUN", rotation=(0.7, -0.5, 0))
-    bpy.context.object.data.energy = 3.5
+    bpy.ops.object.light_add(type="SUN", rotation=(0.85, -0.65, 0))
+    bpy.context.object.data.energy = 2.5
     world = bpy.data.worlds.new("sky")
     scene.world = world
     world.use_nodes = True
     world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.75, 0.85, 1.0, 1)
-    world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.6
+    world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.45
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
-    camera.location, camera.rotation_euler = (0, -11.5, 2.6), (1.447, 0, 0)
+    camera.location, camera.rotation_euler = (0, -10.8, 1.95), (1.50, 0, 0)
     camera.data.lens = 40
     scene.camera = camera
 
@@ -82,8 +82,9 @@ def place(thing, material, across: float, up: float) -> None:
 def render(path: Path) -> None:
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
-    scene.cycles.samples, scene.cycles.seed = 96, 0
-    scene.render.resolution_x, scene.render.resolution_y = 1400, 520
+    scene.cycles.samples, scene.cycles.seed = 32, 0
+    scene.view_settings.view_transform = "Standard"
+    scene.render.resolution_x, scene.render.resolution_y = 1400, 480
     scene.render.image_settings.file_format = "PNG"
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True)

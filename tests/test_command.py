@@ -25,10 +25,11 @@ def inputs(tmp_path):
     return tmp_path
 
 
-def extract(folder, *more, photo="photo.png", masks="masks", out="out"):
+def extract(folder, *more, photos=("photo.png",), masks="masks", out="out"):
     where = ["--masks", str(folder / masks)] if masks else []
     settings = ["--resolution", "96", "--quality", "draft"]
-    return main(["extract", str(folder / photo), *where, *settings, *more, "-o", str(folder / out)])
+    photos = [str(folder / photo) for photo in photos]
+    return main(["extract", *photos, *where, *settings, *more, "-o", str(folder / out)])
 
 
 def bad_mask(folder, pixels, name="a.png"):
@@ -145,7 +146,7 @@ def test_several_photos_make_a_folder_each_and_a_bad_one_does_not_stop_the_rest(
     (inputs / "masks2" / "photo").mkdir(parents=True)
     (inputs / "masks" / "a.png").rename(inputs / "masks2" / "photo" / "a.png")
     (inputs / "broken.png").write_bytes(b"no image")
-    code = extract(inputs, str(inputs / "broken.png"), masks="masks2")
+    code = extract(inputs, photos=("broken.png", "photo.png"), masks="masks2")
     assert code == 2 and "broken.png" in capfd.readouterr().err
     assert (inputs / "out" / "photo" / "palette.blend").exists()
     assert not (inputs / "out" / "broken").exists()

@@ -31,6 +31,6 @@ def segment(
     found = SEGMENTERS[engine](photo_pixels, regions, seed, progress)
     if not found:
         raise PaletteError(
-            f"Segmentation '{engine}' found no region large enough to hold a texture. Use a larger photo or paint masks."
+            f"Segmentation '{engine}' found no region large enough for a texture. Use a larger photo or paint masks."
         )
     return found

@@ -30,6 +30,7 @@ BORDER_SHARE = 0.65  # a
 SIZE_POWER = 0.4  # p
 TOUCHING_UNTIL = 30  # regions; from there on regions that don't touch may merge too
 APART_PENALTY = 2.0
+LEAST_CONTRAST = 0.1  # between two regions, without the size term; below it they are one material
 LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and are left out
 
 
@@ -145,14 +146,16 @@ def _merged(
     parent = np.arange(count)
     version = [0] * count
 
-    def cost(a, b):
+    def contrast(a, b):
         difference = signatures[a] - signatures[b]
         distance = float(difference @ difference)
-        size = (share[a] * share[b] / (share[a] + share[b])) ** SIZE_POWER
         if b not in borders[a]:
-            return APART_PENALTY * distance * size
+            return APART_PENALTY * distance
         length, across = borders[a][b]
-        return distance ** (1 - BORDER_SHARE) * (across / length) ** BORDER_SHARE * size
+        return distance ** (1 - BORDER_SHARE) * (across / length) ** BORDER_SHARE
+
+    def cost(a, b):
+        return contrast(a, b) * (share[a] * share[b] / (share[a] + share[b])) ** SIZE_POWER
 
     def join(a, b):
         histograms[a] += histograms[b]
@@ -179,9 +182,13 @@ def _merged(
             heapq.heappush(queue, (cost(a, other), a, other, version[a], version[other]))
         if len(alive) % 32 == 0:
             progress((count - len(alive)) / count)
-    while sum(share[a] >= LEAST_SHARE for a in alive) > regions:
-        ordered = sorted(alive)
-        join(*min(((a, b) for a in ordered for b in ordered if a < b), key=lambda pair: cost(*pair)))
+    while len(alive) > 1:
+        pairs = [(a, b) for a in sorted(alive) for b in alive if a < b]
+        if sum(share[a] >= LEAST_SHARE for a in alive) <= regions:
+            pairs = [pair for pair in pairs if contrast(*pair) < LEAST_CONTRAST]
+        if not pairs:
+            break
+        join(*min(pairs, key=lambda pair: (cost(*pair), pair)))
         progress((count - len(alive)) / count)
     while (parent[parent] != parent).any():
         parent = parent[parent]
