@@ -33,6 +33,7 @@ COMPONENTS = 24
 COARSEST = 48  # px: side of the square with the region's area at the coarsest level, large enough for blocks
 ANCHORS = 768  # positions tried for a quilting block
 BLOCK = 0.45  # side of a quilting block, in sides of that square
+BALANCE = 1.0  # weight of a block's use over the mean use, in variances of the exemplar
 OCCURRENCE = 0.5  # lambda, in median patch distances
 REACHES = (64, 8, 1)  # px of the random jumps
 BAND = 1 << 18  # pixels searched at a time: bounds the memory and the time to cancel
@@ -204,7 +205,8 @@ def _quilt(level: Level, size: tuple[int, int], generator: torch.Generator, repo
         known = torch.isfinite(nearest[place]).float()
         target = canvas[place] * known[..., None]
         error = known @ squares.T - 2 * (target.flatten(1) @ colours.T) + target.square().sum((1, 2))[:, None]
-        error = error / known.sum(1, keepdim=True).clamp_min(1) + spread * used[blocks[:, ::side]].mean(1)
+        error = error / known.sum(1, keepdim=True).clamp_min(1)
+        error = error + BALANCE * spread * used[blocks[:, ::7]].mean(1) / used[level.inside].mean().clamp_min(1e-6)
         best = error.topk(min(4, len(anchors)), largest=False).indices
         pick = torch.randint(best.shape[1], (len(best), 1), generator=generator)
         chosen = blocks[best.gather(1, pick)[:, 0]]
@@ -212,7 +214,7 @@ def _quilt(level: Level, size: tuple[int, int], generator: torch.Generator, repo
         nearest[place] = torch.where(nearer, distance, nearest[place])
         coordinates[place] = torch.where(nearer, chosen, coordinates[place])
         canvas[place] = torch.where(nearer[..., None], level.pixels[chosen], canvas[place])
-        used += torch.bincount(chosen.flatten(), minlength=len(used)) * (level.inside.sum() / (h * w))
+        used += torch.bincount(chosen.flatten(), minlength=len(used))
         report(0.0)
     return _to_sources(level, coordinates.reshape(h, w))
 
