@@ -22,6 +22,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -442,6 +443,29 @@ COMMANDS = {"demo": demo, "extract": extract, "test": test, "package": package}
 # ---------------------------------------------------------------- from the outside in
 
 
+def interruptible(command, arguments):
+    """Run a command so that Ctrl-C ends it as KeyboardInterrupt, whatever comes of it.
+
+    bpy's import swallows the interrupt and leaves numpy half imported, which then fails with errors of its own."""
+    interrupted = []
+
+    def interrupt(number, frame):
+        interrupted.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not where a shell has told its background jobs to ignore it
+        signal.signal(signal.SIGINT, interrupt)
+    try:
+        return command(arguments)
+    except Exception:
+        if interrupted:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def hand_over(command):
     """Become `command`; where a process can't, run it and pass its exit code on."""
     sys.stdout.flush()
@@ -464,7 +488,7 @@ def main(argv):
         if os.path.realpath(sys.prefix) == os.path.realpath(VENV):
             if not is_ready():
                 raise SetupError("requirements.txt has changed: run dev.py with the Python outside {}".format(VENV))
-            return COMMANDS[argv[0]](argv[1:])
+            return interruptible(COMMANDS[argv[0]], argv[1:])
         python = supported_python()
         if python != [sys.executable]:
             python[0] = shutil.which(python[0])

@@ -67,7 +67,7 @@ def check_region(region: Region) -> None:
     if not area:
         raise PaletteError(f"Region '{region.name}' is empty: no pixel of its mask is painted. Paint it or remove it.")
     inside = np.pad(region.mask.astype(np.uint8), 1)  # the photo's edge bounds a region too
-    radius = float(cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).max())
+    radius = float(cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5).max())
     if area < LEAST_AREA or radius < LEAST_RADIUS:
         raise PaletteError(
             f"Region '{region.name}' is too small to hold a texture: {area} px, {2 * radius:.0f} px across at its "

@@ -170,13 +170,23 @@ def test_exit_code_is_the_programs(tmp_path):
 
 
 @posix
-def test_ctrl_c_ends_a_command_with_130():
-    code = (
-        "import dev, sys, time\n"
-        "dev.VENV, dev.is_ready = sys.prefix, lambda: True\n"
-        "dev.COMMANDS['demo'] = lambda arguments: print('runs', flush=True) or time.sleep(60)\n"
-        "sys.exit(dev.main(['demo']))"
-    )
+@pytest.mark.parametrize("swallowed", [False, True])
+def test_ctrl_c_ends_a_command_with_130(swallowed):
+    """Also where a library swallows it while being imported, and something else fails later."""
+    code = f"""
+import dev, sys, time
+def demo(arguments):
+    print("runs", flush=True)
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        if not {swallowed}:
+            raise
+    raise AttributeError("module 'numpy' has no attribute 'matrix'")
+dev.VENV, dev.is_ready = sys.prefix, lambda: True
+dev.COMMANDS["demo"] = demo
+sys.exit(dev.main(["demo"]))
+"""
     with subprocess.Popen(
         [sys.executable, "-c", code],
         cwd=Path(dev.__file__).parent,

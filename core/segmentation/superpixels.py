@@ -11,7 +11,7 @@
 """
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ BORDER_SHARE = 0.65  # a
 SIZE_POWER = 0.4  # p
 TOUCHING_UNTIL = 30  # regions; from there on regions that don't touch may merge too
 APART_PENALTY = 2.0
-LEAST_CONTRAST = 0.1  # between two regions, without the size term; below it they are one material
+LEAST_CONTRAST = 1.0  # between two regions, without the size term; below it they are one material
 LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and are left out
 
 
@@ -48,7 +48,8 @@ def segment_auto(pixels: np.ndarray, regions: int, seed: int, progress: Callable
         histograms, weights, labels, regions, lambda fraction: progress(0.7 + 0.2 * fraction, "Segmenting")
     )
     found = []
-    for mask in _masks(merged[labels], pixels.shape[:2], lambda fraction: progress(0.9 + 0.1 * fraction, "Segmenting")):
+    for fraction, mask in _masks(merged[labels], pixels.shape[:2], progress):
+        progress(0.94 + 0.05 * fraction, "Segmenting")
         try:
             check_region(Region("region", mask))
         except PaletteError:
@@ -207,8 +208,10 @@ def _touching(labels: np.ndarray) -> list[tuple[int, int, int]]:
     return list(zip(*pairs.tolist(), lengths.tolist(), strict=True))
 
 
-def _masks(regions: np.ndarray, shape: tuple[int, int], progress: Callable[[float], None]) -> list[np.ndarray]:
-    """(H, W) bool mask of every region >= 0 in (h, w), borders drawn smoothly at the photo's size."""
+def _masks(
+    regions: np.ndarray, shape: tuple[int, int], progress: Callable[[float, str], None]
+) -> Iterator[tuple[float, np.ndarray]]:
+    """(done of 1, (H, W) bool mask) of every region >= 0 in (h, w), borders drawn smoothly at the photo's size."""
     ids = np.unique(regions)
     best = np.full(shape, -1, np.float32)
     owner = np.zeros(shape, np.uint8)
@@ -217,5 +220,7 @@ def _masks(regions: np.ndarray, shape: tuple[int, int], progress: Callable[[floa
         soft = cv2.resize(soft, shape[::-1], interpolation=cv2.INTER_LINEAR)
         owner[soft > best] = index
         np.maximum(best, soft, out=best)
-        progress((index + 1) / len(ids))
-    return [owner == index for index, region in enumerate(ids) if region >= 0]
+        progress(0.9 + 0.04 * (index + 1) / len(ids), "Segmenting")
+    for index, region in enumerate(ids):
+        if region >= 0:
+            yield index / len(ids), owner == index

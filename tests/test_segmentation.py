@@ -1,0 +1,156 @@
+"""Automatic regions follow materials: by colour or by texture alone, not by light, and wherever their parts lie."""
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from material_palette.core.errors import Cancelled, PaletteError
+from material_palette.core.image import read_mask, read_photo
+from material_palette.core.region import check_region
+from material_palette.core.segmentation import segment
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+def iou(mask, other):
+    return np.count_nonzero(mask & other) / np.count_nonzero(mask | other)
+
+
+def best_iou(regions, mask):
+    return max(iou(region.mask, mask) for region in regions)
+
+
+def plain_slic_kmeans(pixels, count):
+    """The opponent: superpixels clustered by their mean colour."""
+    lab = cv2.cvtColor(np.clip(pixels, 0, 1) ** np.float32(1 / 2.2), cv2.COLOR_RGB2LAB)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, 20, 15.0)
+    slic.iterate(10)
+    labels = slic.getLabels()
+    size = np.bincount(labels.ravel())
+    means = [np.bincount(labels.ravel(), lab[..., c].ravel()) / np.maximum(size, 1) for c in range(3)]
+    cv2.setRNGSeed(0)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.01)
+    owner = cv2.kmeans(np.stack(means, 1).astype(np.float32), count, None, stop, 5, cv2.KMEANS_PP_CENTERS)[1]
+    return [(owner.ravel() == index)[labels] for index in range(count)]
+
+
+def noise(seed, height=360, width=480, scale=(1, 1)):
+    """Grey noise in [0, 1] of mean 0.5, blurred by `scale` px in y and x."""
+    field = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    field = cv2.GaussianBlur(field, (0, 0), sigmaX=scale[1], sigmaY=scale[0])
+    return 0.5 + 0.12 * field / field.std()
+
+
+def coloured(grey, colour):
+    return (grey[..., None] * np.array(colour, np.float32)).clip(0, 1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A photo of three materials and its true masks: gravel, planks in two places, plaster."""
+    gravel, planks, plaster = noise(0), noise(1, scale=(1, 9)), noise(2, scale=(6, 6)) * 0.2 + 0.5
+    pixels = coloured(gravel, (0.5, 0.5, 0.5))
+    masks = {name: np.zeros((360, 480), bool) for name in ("planks", "plaster")}
+    masks["planks"][20:150, 30:200] = masks["planks"][200:340, 300:450] = True
+    cv2.circle(circle := np.zeros((360, 480), np.uint8), (120, 260), 70, 1, -1)
+    masks["plaster"] = circle > 0
+    pixels[masks["planks"]] = coloured(planks, (0.6, 0.4, 0.25))[masks["planks"]]
+    pixels[masks["plaster"]] = coloured(plaster, (0.6, 0.65, 0.8))[masks["plaster"]]
+    masks["gravel"] = ~(masks["planks"] | masks["plaster"])
+    return pixels, masks
+
+
+def test_each_material_is_one_region_even_in_two_places(scene):
+    pixels, masks = scene
+    regions = segment(pixels, regions=3)
+    for name, mask in masks.items():
+        assert best_iou(regions, mask) > 0.9, name
+
+
+def test_light_that_falls_off_does_not_cut_a_material(scene):
+    pixels, masks = scene
+    falloff = np.linspace(1.3, 0.35, 480, dtype=np.float32)[:, None]
+    regions = segment(pixels * falloff, regions=3)
+    assert best_iou(regions, masks["gravel"]) > 0.8
+
+
+def test_textures_of_one_colour_are_told_apart():
+    pixels = coloured(noise(0, scale=(1, 8)), (0.5, 0.45, 0.4))
+    pixels[:, 240:] = coloured(noise(1, scale=(8, 1)), (0.5, 0.45, 0.4))[:, 240:]
+    left = np.zeros((360, 480), bool)
+    left[:, :240] = True
+    assert best_iou(segment(pixels, regions=2), left) > 0.9
+
+
+def test_one_material_is_one_region_however_many_are_asked_for():
+    pixels = coloured(noise(0, scale=(2, 2)), (0.5, 0.45, 0.4)) * np.linspace(1.2, 0.6, 480, dtype=np.float32)[:, None]
+    (region,) = segment(pixels, regions=6)
+    assert region.mask.mean() > 0.95
+
+
+def test_painted_masks_of_a_real_photo_are_found_better_than_by_colour():
+    pixels = read_photo(EXAMPLES / "facade" / "photo.jpg").pixels
+    masks = {
+        name: read_mask(EXAMPLES / "facade" / "masks" / f"{name}.png", pixels.shape[:2])
+        for name in ("stone_wall", "red_wood")
+    }
+    regions, opponent = segment(pixels), plain_slic_kmeans(pixels, 6)
+    found = np.mean([best_iou(regions, mask) for mask in masks.values()])
+    assert found > 0.65 and found > np.mean([max(iou(m, mask) for m in opponent) for mask in masks.values()]) + 0.05
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_regions_are_few_disjoint_ordered_and_large_enough(scene, count):
+    regions = segment(scene[0], regions=count)
+    assert 1 <= len(regions) <= count
+    assert [region.name for region in regions] == [f"region_{n}" for n in range(1, len(regions) + 1)]
+    areas = [np.count_nonzero(region.mask) for region in regions]
+    assert areas == sorted(areas, reverse=True)
+    assert np.sum([region.mask for region in regions], 0).max() == 1
+    for region in regions:
+        assert region.mask.shape == scene[0].shape[:2] and region.mask.dtype == bool
+        check_region(region)
+
+
+def test_segmentation_is_the_same_again_and_at_any_exposure(scene):
+    first, again, bright = segment(scene[0]), segment(scene[0].copy()), segment(scene[0] * 2.0**12)
+    assert all((a.mask == b.mask).all() for a, b in zip(first, again, strict=True))
+    for region in first:
+        assert best_iou(bright, region.mask) > 0.8
+
+
+def test_two_megapixels_take_at_most_four_seconds_and_stop_at_once(scene):
+    pixels = cv2.resize(scene[0], (1632, 1224), interpolation=cv2.INTER_CUBIC).clip(0)
+    calls = [(time.perf_counter(), 0.0)]
+    segment(pixels, progress=lambda fraction, message: calls.append((time.perf_counter(), fraction)))
+    times, fractions = zip(*calls, strict=True)
+    assert times[-1] - times[0] < 4
+    assert np.diff(times).max() < 0.5  # the longest that a stop can take
+    assert fractions[-1] == 1 and (np.diff(fractions) >= 0).all()
+
+    def stop(fraction, message):
+        if fraction > 0.3:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        segment(pixels, progress=stop)
+
+
+def test_wrong_settings_are_named():
+    pixels = np.full((64, 64, 3), 0.5, np.float32)
+    with pytest.raises(PaletteError, match="no segmentation 'sam'; there is: auto"):
+        segment(pixels, engine="sam")
+    for count in (0, -1, 33):
+        with pytest.raises(PaletteError, match=f"number of regions is {count}; it must be from 1 to 32"):
+            segment(pixels, regions=count)
+
+
+def test_least_and_uniform_photos(scene):
+    (region,) = segment(np.full((64, 64, 3), 0.5, np.float32))
+    assert region.mask.all()
+    (region,) = segment(np.zeros((32, 32, 3), np.float32))
+    assert region.mask.all()
+    assert segment(scene[0][:32, :200])
+    assert segment(scene[0][:32, :32])
