@@ -33,6 +33,7 @@ VENV = os.path.join(ROOT, ".venv")
 REQUIREMENTS = os.path.join(ROOT, "requirements.txt")
 EXAMPLE = os.path.join(ROOT, "examples", "viaduct")
 PYTHONS = ((3, 11), (3, 13))  # the ones Blender's modules in requirements.txt are built for
+LIBRARIES = ("bpy", "cv2", "numpy", "OpenImageIO", "torch")  # what requirements.txt installs for the pipeline
 DISK_NEEDED = 4e9  # bytes: 2 GB installed, the rest for pip's downloads and unpacking
 ZIP_LIMIT = 45e6  # bytes, without wheels
 DEBIAN_PACKAGES = {
@@ -261,9 +262,11 @@ def pip_failure(lines):
 
 def check_imports():
     """Refuse an environment whose compiled modules don't load; name the system libraries that are missing."""
-    wanted = "import bpy, cv2, numpy, OpenImageIO, torch"
     done = subprocess.run(
-        [venv_python(VENV), "-c", wanted], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=clean_environ()
+        [venv_python(VENV), "-c", "import " + ", ".join(LIBRARIES)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=clean_environ(),
     )
     if done.returncode:
         raise SetupError(import_failure(done.stdout.decode("utf-8", "replace"), missing_libraries()))
@@ -307,7 +310,23 @@ def load_package():
     return sys.modules["material_palette"]
 
 
+def import_libraries():
+    """Import what the pipeline needs, and let Ctrl-C wait for it: the imports of compiled modules swallow it."""
+    pressed = []
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # and not ignored, as in a shell's background job
+        signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        for name in LIBRARIES:
+            importlib.import_module(name)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
+
+
 def extract(arguments):
+    import_libraries()
     load_package()
     return importlib.import_module("material_palette.core.command").main(["extract", *arguments])
 
@@ -443,29 +462,6 @@ COMMANDS = {"demo": demo, "extract": extract, "test": test, "package": package}
 # ---------------------------------------------------------------- from the outside in
 
 
-def interruptible(command, arguments):
-    """Run a command so that Ctrl-C ends it as KeyboardInterrupt, whatever comes of it.
-
-    bpy's import swallows the interrupt and leaves numpy half imported, which then fails with errors of its own."""
-    interrupted = []
-
-    def interrupt(number, frame):
-        interrupted.append(number)
-        raise KeyboardInterrupt
-
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # not where a shell has told its background jobs to ignore it
-        signal.signal(signal.SIGINT, interrupt)
-    try:
-        return command(arguments)
-    except Exception:
-        if interrupted:
-            raise KeyboardInterrupt from None
-        raise
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def hand_over(command):
     """Become `command`; where a process can't, run it and pass its exit code on."""
     sys.stdout.flush()
@@ -488,7 +484,7 @@ def main(argv):
         if os.path.realpath(sys.prefix) == os.path.realpath(VENV):
             if not is_ready():
                 raise SetupError("requirements.txt has changed: run dev.py with the Python outside {}".format(VENV))
-            return interruptible(COMMANDS[argv[0]], argv[1:])
+            return COMMANDS[argv[0]](argv[1:])
         python = supported_python()
         if python != [sys.executable]:
             python[0] = shutil.which(python[0])

@@ -109,19 +109,20 @@ def read_photo(
             negative += np.count_nonzero((rgb < -1e-4).any(-1))
             _add_rows(pixels, np.maximum(rgb, 0), row, spec.height)
             progress((row + len(block)) / spec.height, "Reading the photo")
-        upright = _upright(pixels, spec.get_int_attribute("Orientation", 1))
+        orientation = spec.get_int_attribute("Orientation", 1)
+        upright = _upright(pixels, orientation)
         total = spec.width * spec.height
     if transparent:
         warnings.append(
-            f"{100 * transparent / total:.2g} % of the photo is transparent: the colour stored there is used where a "
+            f"{100 * transparent / total:.3g} % of the photo is transparent: the colour stored there is used where a "
             f"region covers it."
         )
     if negative:
         warnings.append(
-            f"{100 * negative / total:.2g} % of the pixels lie outside Rec.709; what is negative there became 0."
+            f"{100 * negative / total:.3g} % of the pixels lie outside Rec.709; what is negative there became 0."
         )
     if (height, width) != (spec.height, spec.width):
-        large = (spec.width, spec.height) if upright.shape[:2] == (height, width) else (spec.height, spec.width)
+        large = (spec.width, spec.height) if orientation < 5 else (spec.height, spec.width)
         warnings.append(
             f"The photo was reduced from {large[0]} x {large[1]} px to {upright.shape[1]} x {upright.shape[0]} px: "
             f"at most {max_pixels / 1e6:g} megapixels are used."

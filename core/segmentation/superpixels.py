@@ -7,7 +7,8 @@
 3. Merge neighbours, then any two regions, cheapest first:
        cost = D(A, B)^(1 - a) * D(along their border)^a * (|A| |B| / ((|A| + |B|) |photo|))^p
    The border term compares only superpixels that touch: light that falls off over a floor doesn't cut it in two. The
-   size term is Ward's, tempered. Regions that don't touch have no border; they pay a penalty instead.
+   size term is Ward's, tempered. Regions that don't touch have no border; they pay a penalty instead. Merging ends
+   when few enough regions are left and none are alike.
 """
 
 import heapq
@@ -72,6 +73,11 @@ def _lab(pixels: np.ndarray) -> np.ndarray:
 
 def _superpixels(lab: np.ndarray, progress: Callable[[float], None]) -> np.ndarray:
     """(h, w) labels 0..n-1 of connected superpixels."""
+    if not hasattr(cv2, "ximgproc"):
+        raise PaletteError(
+            "Segmentation 'auto' needs OpenCV with its contrib modules (opencv-contrib-python-headless). "
+            "Install it or paint masks."
+        )
     side = max(6, int((lab.shape[0] * lab.shape[1] / SUPERPIXELS) ** 0.5))
     smooth = cv2.GaussianBlur(lab, (0, 0), 1)
     slic = cv2.ximgproc.createSuperpixelSLIC(smooth, cv2.ximgproc.SLIC, side, SLIC_RULER)
