@@ -2,7 +2,7 @@
 
     .venv/bin/python docs/pictures.py
 
-extracts both examples into demo/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg. 3 minutes.
+extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg. 3 minutes.
 """
 
 import sys
@@ -25,7 +25,7 @@ REPEATS = 1.0  # of the tile along a wall
 
 
 def extract(example: str) -> Path:
-    source, folder = ROOT / "examples" / example, ROOT / "demo" / "pictures" / example
+    source, folder = ROOT / "examples" / example, ROOT / "dist" / "pictures" / example
     where = ["--masks", str(source / "masks"), "--overwrite", "-o", str(folder)]
     if main(["extract", str(source / "photo.jpg"), *where]):
         raise SystemExit(f"the example {example} could not be extracted")
@@ -95,6 +95,6 @@ if __name__ == "__main__":
     for example, name in SHEETS.items():
         save(cv2.imread(str(folders[example] / "palette.png")), DOCS / f"{name}.jpg", 1400)
     build_scene(folders)
-    rendered = ROOT / "demo" / "pictures" / "render.png"
+    rendered = ROOT / "dist" / "pictures" / "render.png"
     render(rendered)
     save(cv2.imread(str(rendered)), DOCS / "render.jpg", 1400)
