@@ -83,6 +83,8 @@ def spoil(name):
         "unknown segmenter": (nothing, {"masks": None, "more": ["--segment", "magic"]}, "magic"),
         "no regions asked": (nothing, {"masks": None}, "--masks"),
         "existing output": (existing_output, {}, "--overwrite"),
+        "unwritable output": (nothing, {"out": "photo.png/out"}, "photo.png"),
+        "only an empty mask": (lambda f: [bad_mask(f, np.zeros((120, 200)), n) for n in ("a.png", "b.png")], {}, "'a'"),
     }[name]
 
 
@@ -102,6 +104,8 @@ CASES = [
     "unknown segmenter",
     "no regions asked",
     "existing output",
+    "unwritable output",
+    "only an empty mask",
 ]
 
 
@@ -110,7 +114,7 @@ def test_bad_input_is_named_and_nothing_is_written(inputs, capfd, name):
     change, how, said = spoil(name)
     change(inputs)
     before = sorted(p for p in inputs.rglob("*"))
-    assert extract(inputs, *how.get("more", []), masks=how.get("masks", "masks")) == 2
+    assert extract(inputs, *how.get("more", []), masks=how.get("masks", "masks"), out=how.get("out", "out")) == 2
     error = capfd.readouterr().err
     assert said in error and "Traceback" not in error
     assert sorted(p for p in inputs.rglob("*")) == before

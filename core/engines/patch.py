@@ -9,10 +9,11 @@ coordinate c(p) of an exemplar pixel. Per level, from coarse to fine, a few roun
 
 F are the principal components of the patch around a pixel, o says how often a source is already used. Candidates are
 the continuations of the neighbours' sources (coherence) and random jumps of falling reach. All indices wrap, so the
-texture tiles by construction; c carries any channel of the exemplar along.
+texture tiles by construction; c carries any channel of the exemplar along. Where the exemplar repeats with a period,
+the tile is a whole number of periods and a source that is out of phase costs more: courses stay straight and close.
 
 Sources: Efros and Freeman 2001 (quilting), Kwatra et al. 2005 (texture optimisation), Lefebvre and Hoppe 2005
-(coordinates, coherence, PCA), Barnes et al. 2009 (PatchMatch), Kaspar et al. 2015 (occurrence).
+(coordinates, coherence, PCA), Barnes et al. 2009 (PatchMatch), Kaspar et al. 2015 (occurrence, guidance by periods).
 """
 
 import math
@@ -24,6 +25,7 @@ import torch
 import torch.nn.functional as F
 
 from ..errors import PaletteError
+from .lattice import find_periods
 
 Progress = Callable[[float, str], None]
 
@@ -34,6 +36,9 @@ COARSEST = 48  # px: side of the square with the region's area at the coarsest l
 ANCHORS = 768  # positions tried for a quilting block
 BLOCK = 0.45  # side of a quilting block, in sides of that square
 BALANCE = 1.0  # weight of a block's use over the mean use, in variances of the exemplar
+IN_PHASE = 4.0  # weight of a block's misfit with the lattice, in variances
+OUT_OF_PHASE = 1.0  # the same for a source, in median patch distances
+SHORTEST_PERIOD = 3.0  # px; below it a level is too coarse to see the phase
 OCCURRENCE = 0.5  # lambda, in median patch distances
 REACHES = (64, 8, 1)  # px of the random jumps
 BAND = 1 << 18  # pixels searched at a time: bounds the memory and the time to cancel
@@ -58,6 +63,7 @@ class Concept:
     """What is learnt of a region: its patches over scales, the finest level first."""
 
     levels: list[Level]
+    periods: tuple[float | None, float | None]  # px at the finest level, downwards and to the right
 
 
 @dataclass
@@ -93,7 +99,7 @@ def learn(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> Concept:
         raise PaletteError(
             f"the region holds too few patches of {PATCH} x {PATCH} px; paint a wider area or use a larger photo"
         )
-    return Concept(levels)
+    return Concept(levels, find_periods(pixels, mask))
 
 
 def _level(colour: torch.Tensor, weight: torch.Tensor) -> Level | None:
@@ -141,13 +147,14 @@ def sample(
     levels = concept.levels[: len(sizes)]
     rounds = [coarse_rounds if i else finest_rounds for i in range(len(sizes))]
     work = [h * w * n for (h, w), n in zip(sizes, rounds, strict=True)]
+    phases = [_Phases(concept.periods, level, size, sizes[0]) for level, size in zip(levels, sizes, strict=True)]
     done = 0.0
 
     def report(fraction: float) -> None:
         progress(min(1.0, (done + fraction * share) / sum(work)), "sampling the texture")
 
     share = 0
-    coordinates = _quilt(levels[-1], sizes[-1], generator, report)
+    coordinates = _quilt(levels[-1], sizes[-1], phases[-1], generator, report)
     for i in reversed(range(len(levels))):
         level = levels[i]
         if i < len(levels) - 1:
@@ -155,7 +162,7 @@ def sample(
         share = work[i] / rounds[i]
         for _ in range(rounds[i]):
             image = _vote(level, coordinates, report)
-            _search(level, image, coordinates, generator, report)
+            _search(level, image, coordinates, phases[i], generator, report)
             done += share
     share = 0
     image = _vote(levels[0], coordinates, report)
@@ -172,7 +179,31 @@ def _calmest(image: torch.Tensor) -> tuple[int, int]:
     return -int(rows.argmin()), -int(columns.argmin())
 
 
-def _quilt(level: Level, size: tuple[int, int], generator: torch.Generator, report) -> torch.Tensor:
+class _Phases:
+    """How far a source is out of step with the place it would fill, along the axes in which the exemplar repeats.
+
+    The texture's period is the exemplar's, stretched a little so that a whole number fits the tile.
+    """
+
+    def __init__(self, periods, level: Level, size: tuple[int, int], full_size: tuple[int, int]):
+        self.axes = []
+        for axis, period in enumerate(periods):
+            count = round(full_size[axis] / period) if period else 0
+            own = period * size[axis] / full_size[axis] if period else 0.0
+            if count and own >= SHORTEST_PERIOD:
+                self.axes.append((axis, 2 * math.pi / own, 2 * math.pi * count / size[axis]))
+        self.stride = level.shape[1]
+
+    def misfit(self, source: torch.Tensor, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor | float:
+        """0 in phase to 2 in opposition, per axis; source are flattened coordinates, y and x rows and columns."""
+        total = 0.0
+        for axis, exemplar, texture in self.axes:
+            position = source % self.stride if axis else source // self.stride
+            total = total + 1 - torch.cos(position * exemplar - (x if axis else y) * texture)
+        return total
+
+
+def _quilt(level: Level, size: tuple[int, int], phases: _Phases, generator: torch.Generator, report) -> torch.Tensor:
     """Coordinates (H, W) of a toroidal quilt: blocks of the exemplar whose overlaps agree, all sources used alike.
 
     A pixel belongs to the block whose centre is nearest; finding the best seam is left to `_search`.
@@ -207,6 +238,8 @@ def _quilt(level: Level, size: tuple[int, int], generator: torch.Generator, repo
         error = known @ squares.T - 2 * (target.flatten(1) @ colours.T) + target.square().sum((1, 2))[:, None]
         error = error / known.sum(1, keepdim=True).clamp_min(1)
         error = error + BALANCE * spread * used[blocks[:, ::7]].mean(1) / used[level.inside].mean().clamp_min(1e-6)
+        if phases.axes:
+            error = error + IN_PHASE * spread * phases.misfit(anchors[None], y[:, :1], x[:, :1])
         best = error.topk(min(4, len(anchors)), largest=False).indices
         pick = torch.randint(best.shape[1], (len(best), 1), generator=generator)
         chosen = blocks[best.gather(1, pick)[:, 0]]
@@ -273,45 +306,54 @@ def _vote(level: Level, coordinates: torch.Tensor, report) -> torch.Tensor:
     return image.reshape(h, w, 3)
 
 
-def _search(level: Level, image: torch.Tensor, coordinates: torch.Tensor, generator: torch.Generator, report) -> None:
+def _search(level: Level, image: torch.Tensor, coordinates: torch.Tensor, phases: _Phases, generator, report) -> None:
     """One round of search; changes coordinates in place."""
     h, w = coordinates.shape
     stride = level.shape[1]
     used = torch.bincount(coordinates.flatten(), minlength=len(level.valid)).float().reshape(1, 1, *level.shape)
     used = F.avg_pool2d(used, 5, 1, 2).flatten() * (level.valid.sum() / (h * w))
-    penalty = None
+    scale = None
     for top, end in _bands(h, w):
         rows = torch.arange(top - RADIUS, end + RADIUS) % h
         wide = F.pad(image[rows].permute(2, 0, 1)[None], (RADIUS, RADIUS, 0, 0), mode="circular")
         target = F.conv2d(wide, level.basis)[0].flatten(1).T.contiguous()
         current = coordinates[top:end].flatten()
-        cost = (target - level.features.index_select(0, current)).square().sum(1)
-        if penalty is None:
-            penalty = used * (OCCURRENCE * cost.median())
-        cost += penalty[current]
+
+        if scale is None:
+            scale = (target - level.features.index_select(0, current)).square_().sum(1).median()
+
+        def cost_of(where, source, target=target, top=top, scale=scale) -> torch.Tensor:
+            cost = (target[where] - level.features.index_select(0, source)).square_().sum(1)
+            cost += OCCURRENCE * scale * used[source]
+            if phases.axes:
+                place = top * w + where
+                cost += OUT_OF_PHASE * scale * phases.misfit(source, place // w, place % w)
+            return cost
+
+        cost = cost_of(torch.arange(len(current)), current)
         report(0.2 + 0.8 * top / h)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 if dy or dx:
                     # the band's own rows in their newest state, so that good sources travel far in one round
                     coordinates[top:end] = current.reshape(-1, w)
-                    _improve(level, target, penalty, current, cost, _neighbours(coordinates, top, end, dy, dx, stride))
+                    _improve(level, cost_of, current, cost, _neighbours(coordinates, top, end, dy, dx, stride))
             report(0.2 + 0.8 * top / h)
         for reach in REACHES:
             jump = torch.randint(-reach, reach + 1, (2, len(current)), generator=generator)
-            _improve(level, target, penalty, current, cost, current + jump[0] * stride + jump[1])
+            _improve(level, cost_of, current, cost, current + jump[0] * stride + jump[1])
             report(0.2 + 0.8 * top / h)
         coordinates[top:end] = current.reshape(-1, w)
 
 
-def _improve(level: Level, target, penalty, current, cost, candidate) -> None:
+def _improve(level: Level, cost_of: Callable, current: torch.Tensor, cost: torch.Tensor, candidate) -> None:
     """Takes the candidate sources that are better, in place."""
     ok = (candidate != current) & (candidate >= 0) & (candidate < len(level.valid))
     where = ok.nonzero()[:, 0]
     where = where[level.valid[candidate[where]]]
-    q = candidate[where]
-    d = (target[where] - level.features.index_select(0, q)).square_().sum(1) + penalty[q]
-    better = d < cost[where]
+    source = candidate[where]
+    found = cost_of(where, source)
+    better = found < cost[where]
     where = where[better]
-    current[where] = q[better]
-    cost[where] = d[better]
+    current[where] = source[better]
+    cost[where] = found[better]
