@@ -17,7 +17,9 @@ Sources: Efros and Freeman 2001 (quilting), Kwatra et al. 2005 (texture optimisa
 """
 
 import math
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +43,7 @@ OUT_OF_PHASE = 1.0  # the same for a source, in median patch distances
 SHORTEST_PERIOD = 3.0  # px; below it a level is too coarse to see the phase
 OCCURRENCE = 0.5  # lambda, in median patch distances
 REACHES = (64, 8, 1)  # px of the random jumps
-BAND = 1 << 18  # pixels searched at a time: bounds the memory and the time to cancel
+BAND = 1 << 16  # pixels searched at a time by a thread
 
 ROUNDS = {"draft": (2, 1), "balanced": (6, 2), "best": (10, 4)}  # per coarse level, at the finest level
 
@@ -137,7 +139,8 @@ def sample(
 ) -> Texture:
     """A tileable texture of size (H, W) px, at the exemplar's scale.
 
-    quality is a key of ROUNDS. The same concept, size, quality and seed give the same texture, bit for bit.
+    quality is a key of ROUNDS. The same concept, size, quality and seed give the same texture, bit for bit,
+    on any number of cores.
     """
     coarse_rounds, finest_rounds = ROUNDS[quality]
     generator = torch.Generator().manual_seed(seed)
@@ -155,17 +158,21 @@ def sample(
 
     share = 0
     coordinates = _quilt(levels[-1], sizes[-1], phases[-1], generator, report)
-    for i in reversed(range(len(levels))):
-        level = levels[i]
-        if i < len(levels) - 1:
-            coordinates = _upsample(level, levels[i + 1], coordinates, sizes[i])
-        share = work[i] / rounds[i]
-        for _ in range(rounds[i]):
-            image = _vote(level, coordinates, report)
-            _search(level, image, coordinates, phases[i], generator, report)
-            done += share
-    share = 0
-    image = _vote(levels[0], coordinates, report)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for i in reversed(range(len(levels))):
+            level = levels[i]
+            if i < len(levels) - 1:
+                coordinates = _upsample(level, levels[i + 1], coordinates, sizes[i])
+            share = work[i] / rounds[i]
+            for _ in range(rounds[i]):
+                image = _vote(level, coordinates, pool, lambda fraction: report(0.2 * fraction))
+                jumps = int(torch.randint(2**31, (1,), generator=generator))
+                coordinates = _search(
+                    level, image, coordinates, phases[i], jumps, pool, lambda fraction: report(0.2 + 0.8 * fraction)
+                )
+                done += share
+        share = 0
+        image = _vote(levels[0], coordinates, pool, report)
     columns = levels[0].shape[1]
     coordinates = torch.stack([coordinates // columns, coordinates % columns], -1)
     shift = _calmest(image)
@@ -280,49 +287,74 @@ def _to_sources(level: Level, coordinates: torch.Tensor) -> torch.Tensor:
     return sources[rank.clamp_max(len(sources) - 1)]
 
 
-def _bands(h: int, w: int) -> list[tuple[int, int]]:
+def _each_band(size: tuple[int, int], work: Callable, pool: ThreadPoolExecutor, report) -> None:
+    """work(number, top, end) for bands of rows that cover the texture, on all cores. A band bounds the memory and the
+    time to cancel; its result may not depend on another band's, so that the order does not matter."""
+    h, w = size
     rows = max(1, BAND // w)
-    return [(top, min(h, top + rows)) for top in range(0, h, rows)]
+    tops = range(0, h, rows)
+    working = [pool.submit(work, number, top, min(h, top + rows)) for number, top in enumerate(tops)]
+    try:
+        for number, band in enumerate(working):
+            band.result()
+            report((number + 1) / len(working))
+    except BaseException:
+        for band in working:
+            band.cancel()
+        raise
 
 
-def _neighbours(coordinates: torch.Tensor, top: int, end: int, dy: int, dx: int, stride: int) -> torch.Tensor:
-    """c(p + d) - d for the rows top to end, flattened: where the neighbour's source continues. May be no source."""
-    rows = torch.arange(top + dy, end + dy) % len(coordinates)
-    return (coordinates[rows].roll(-dx, 1) - (dy * stride + dx)).flatten()
+def _with_halo(x: torch.Tensor, top: int, end: int, halo: int) -> torch.Tensor:
+    """The rows top to end of x (H, ...) and `halo` more on either side, wrapping."""
+    return x[torch.arange(top - halo, end + halo) % len(x)]
 
 
-def _vote(level: Level, coordinates: torch.Tensor, report) -> torch.Tensor:
+def _continued(wide: torch.Tensor, halo: int, dy: int, dx: int, stride: int) -> torch.Tensor:
+    """c(p + d) - d for the rows within the halo, flattened: where the neighbour's source goes on. May be no source."""
+    return (wide[halo + dy : len(wide) - halo + dy].roll(-dx, 1) - (dy * stride + dx)).flatten()
+
+
+def _vote(level: Level, coordinates: torch.Tensor, pool: ThreadPoolExecutor, report) -> torch.Tensor:
     """The texture (H, W, 3): for each pixel the weighted mean of what the patches around it say."""
     h, w = coordinates.shape
-    image = torch.empty(h * w, 3)
+    image = torch.zeros(h * w, 3)
     offsets = [(dy, dx, math.exp(-(dy * dy + dx * dx) / 8)) for dy in (-2, 0, 2) for dx in (-2, 0, 2)]
     total = sum(g for *_, g in offsets)
-    for top, end in _bands(h, w):
-        part = image[top * w : end * w].zero_()
+
+    def vote(number: int, top: int, end: int) -> None:
+        wide = _with_halo(coordinates, top, end, 2)
+        part = image[top * w : end * w]
         for dy, dx, g in offsets:
-            index = _neighbours(coordinates, top, end, dy, dx, level.shape[1])
-            part.add_(level.pixels.index_select(0, index), alpha=g / total)
-        report(0.2 * end / h)
+            source = _continued(wide, 2, dy, dx, level.shape[1])
+            part.add_(level.pixels.index_select(0, source), alpha=g / total)
+
+    _each_band((h, w), vote, pool, report)
     return image.reshape(h, w, 3)
 
 
-def _search(level: Level, image: torch.Tensor, coordinates: torch.Tensor, phases: _Phases, generator, report) -> None:
-    """One round of search; changes coordinates in place."""
-    h, w = coordinates.shape
+def _search(level: Level, image, before, phases: _Phases, seed: int, pool: ThreadPoolExecutor, report) -> torch.Tensor:
+    """One round of search: better coordinates (H, W) than `before` for the texture `image` (H, W, 3)."""
+    h, w = before.shape
     stride = level.shape[1]
-    used = torch.bincount(coordinates.flatten(), minlength=len(level.valid)).float().reshape(1, 1, *level.shape)
+    after = torch.empty_like(before)
+    used = torch.bincount(before.flatten(), minlength=len(level.valid)).float().reshape(1, 1, *level.shape)
     used = F.avg_pool2d(used, 5, 1, 2).flatten() * (level.valid.sum() / (h * w))
-    scale = None
-    for top, end in _bands(h, w):
-        rows = torch.arange(top - RADIUS, end + RADIUS) % h
-        wide = F.pad(image[rows].permute(2, 0, 1)[None], (RADIUS, RADIUS, 0, 0), mode="circular")
-        target = F.conv2d(wide, level.basis)[0].flatten(1).T.contiguous()
-        current = coordinates[top:end].flatten()
 
-        if scale is None:
-            scale = (target - level.features.index_select(0, current)).square_().sum(1).median()
+    def target_of(top: int, end: int) -> torch.Tensor:
+        wide = _with_halo(image, top, end, RADIUS).permute(2, 0, 1)[None]
+        wide = F.pad(wide, (RADIUS, RADIUS, 0, 0), mode="circular")
+        return F.conv2d(wide, level.basis)[0].flatten(1).T.contiguous()
 
-        def cost_of(where, source, target=target, top=top, scale=scale) -> torch.Tensor:
+    some = min(h, max(1, BAND // w))
+    distance = (target_of(0, some) - level.features[before[:some].flatten()]).square_().sum(1)
+    scale = distance.median()
+
+    def search(number: int, top: int, end: int) -> None:
+        target = target_of(top, end)
+        current = before[top:end].flatten()
+        above, below = before[top - 1], before[end % h]
+
+        def cost_of(where: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
             cost = (target[where] - level.features.index_select(0, source)).square_().sum(1)
             cost += OCCURRENCE * scale * used[source]
             if phases.axes:
@@ -331,19 +363,20 @@ def _search(level: Level, image: torch.Tensor, coordinates: torch.Tensor, phases
             return cost
 
         cost = cost_of(torch.arange(len(current)), current)
-        report(0.2 + 0.8 * top / h)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 if dy or dx:
-                    # the band's own rows in their newest state, so that good sources travel far in one round
-                    coordinates[top:end] = current.reshape(-1, w)
-                    _improve(level, cost_of, current, cost, _neighbours(coordinates, top, end, dy, dx, stride))
-            report(0.2 + 0.8 * top / h)
+                    # the band's rows in their newest state, so that good sources travel far in one round
+                    wide = torch.cat([above[None], current.reshape(-1, w), below[None]])
+                    _improve(level, cost_of, current, cost, _continued(wide, 1, dy, dx, stride))
+        generator = torch.Generator().manual_seed(seed + number)
         for reach in REACHES:
             jump = torch.randint(-reach, reach + 1, (2, len(current)), generator=generator)
             _improve(level, cost_of, current, cost, current + jump[0] * stride + jump[1])
-            report(0.2 + 0.8 * top / h)
-        coordinates[top:end] = current.reshape(-1, w)
+        after[top:end] = current.reshape(-1, w)
+
+    _each_band((h, w), search, pool, report)
+    return after
 
 
 def _improve(level: Level, cost_of: Callable, current: torch.Tensor, cost: torch.Tensor, candidate) -> None:
