@@ -5,11 +5,8 @@ photo + regions -> exemplar -> concept -> texture -> SVBRDF -> reduced SVBRDF ->
 
 import dataclasses
 import json
-import os
-import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +15,7 @@ import numpy as np
 import torch
 
 from . import brdf, decomposition, engines, reduction, sheet
-from .errors import Cancelled, PaletteError
+from .errors import PaletteError
 from .exemplar import cut_exemplar
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
@@ -28,7 +25,6 @@ VERSION = 1  # of palette.json
 QUALITIES = tuple(engines.patch.ROUNDS)
 RESOLUTION_RANGE = (64, 8192)
 PREVIEW = 256  # px
-MOST_AT_ONCE = 4  # regions; each holds its own working memory
 
 Progress = Callable[[float, str], None]
 
@@ -108,47 +104,26 @@ def extract_palette(
     """Extract one material per region of a photo (H, W, 3) float32 linear.
 
     A region that cannot be extracted becomes a material with status "failed"; the others are finished. on_material is
-    called with each material as soon as it is done. progress and on_material are called from worker threads, one at a
-    time; progress may raise Cancelled, which ends the call.
+    called with each material as soon as it is done. progress may raise Cancelled, which ends the call.
     Raises PaletteError for settings that cannot be honoured and when there is no region.
     """
     settings.check()
     if not regions:
         raise PaletteError("there is no region; paint one or choose automatic segmentation")
     start = time.perf_counter()
-    fractions = [0.0] * len(regions)
-    turn = threading.Lock()
-    stopped = threading.Event()
-
-    def extract(i: int) -> Material:
-        def report(fraction: float, message: str) -> None:
-            with turn:
-                if stopped.is_set():
-                    raise Cancelled
-                fractions[i] = max(fractions[i], fraction)
-                progress(sum(fractions) / len(regions), f"{regions[i].name}: {message}")
-
-        try:
-            material = extract_material(pixels, regions[i], settings, report)
-        except PaletteError as error:
-            material = Material(regions[i].name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
-        with turn:
-            fractions[i] = 1.0
-            if on_material and not stopped.is_set():
+    palette = Palette(pixels, photo_name, regions, settings, [])
+    with _one_thread_each():
+        for i, region in enumerate(regions):
+            share = _part(progress, i / len(regions), (i + 1) / len(regions), f"{region.name}: ")
+            try:
+                material = extract_material(pixels, region, settings, share)
+            except PaletteError as error:
+                material = Material(region.name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
+            palette.materials.append(material)
+            if on_material:
                 on_material(material)
-        return material
-
-    with _one_thread_each(), ThreadPoolExecutor(min(len(regions), os.cpu_count() or 1, MOST_AT_ONCE)) as pool:
-        extracting = [pool.submit(extract, i) for i in range(len(regions))]
-        try:
-            materials = [future.result() for future in extracting]
-        except BaseException:
-            stopped.set()
-            pool.shutdown(cancel_futures=True)
-            raise
     progress(1.0, "done")
-    palette = Palette(pixels, photo_name, regions, settings, materials)
-    for material in materials:
+    for material in palette.materials:
         for stage, seconds in material.seconds.items():
             palette.seconds[stage] = palette.seconds.get(stage, 0.0) + seconds
     palette.seconds["extract"] = time.perf_counter() - start
@@ -157,8 +132,8 @@ def extract_palette(
 
 @contextmanager
 def _one_thread_each():
-    """Regions run side by side on one torch thread each: threads within an operation wait on each other when a core is
-    busy with something else, such as Blender's window, and then lose far more than they gain."""
+    """Engines share their work among threads of their own, each with one torch thread. Threads within an operation wait
+    on each other when a core is busy with something else, such as Blender's window, and lose more than they gain."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -282,8 +257,8 @@ def _write_json(path: Path, content: dict) -> None:
 
 
 def _part(progress: Progress, start: float, end: float, prefix: str = "") -> Progress:
-    """Progress of a stage, mapped to its part of the whole."""
-    return lambda fraction, message: progress(start + (end - start) * fraction, prefix + message)
+    """Progress of a stage, mapped to its part of the whole; exact at both ends, so that the whole never steps back."""
+    return lambda fraction, message: progress((1 - fraction) * start + fraction * end, prefix + message)
 
 
 @contextmanager
