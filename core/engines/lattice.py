@@ -52,6 +52,7 @@ def _period(correlation: np.ndarray) -> float | None:
     """The period whose multiples stand out most in the correlation at shifts 0, 1, 2 .. px, or None."""
     reach = int(np.argmin(correlation != 0)) or len(correlation)
     shifts = np.arange(reach)
+
     def at(shift):
         return np.interp(shift, shifts, correlation[:reach])
 

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -37,11 +38,13 @@ COMPONENTS = 24
 COARSEST = 48  # px: side of the square with the region's area at the coarsest level, large enough for blocks
 ANCHORS = 768  # positions tried for a quilting block
 BLOCK = 0.45  # side of a quilting block, in sides of that square
-BALANCE = 1.0  # weight of a block's use over the mean use, in variances of the exemplar
+BALANCE = 0.5  # weight of a block's use over the mean use, in variances of the exemplar
+MOST_STRETCH = 0.1  # of the exemplar, to fit a whole number of its periods into the tile
 IN_PHASE = 4.0  # weight of a block's misfit with the lattice, in variances
 OUT_OF_PHASE = 1.0  # the same for a source, in median patch distances
 SHORTEST_PERIOD = 3.0  # px; below it a level is too coarse to see the phase
-OCCURRENCE = 0.5  # lambda, in median patch distances
+OCCURRENCE = 3.0  # lambda, in median patch distances
+COHERENCE = 0.6  # a random source must cost less than this share of one that continues a neighbour
 REACHES = (64, 8, 1)  # px of the random jumps
 BAND = 1 << 16  # pixels searched at a time by a thread
 
@@ -64,8 +67,10 @@ class Level:
 class Concept:
     """What is learnt of a region: its patches over scales, the finest level first."""
 
+    pixels: np.ndarray  # (h, w, 3), the exemplar
+    mask: np.ndarray
+    periods: tuple[float | None, float | None]  # px, downwards and to the right
     levels: list[Level]
-    periods: tuple[float | None, float | None]  # px at the finest level, downwards and to the right
 
 
 @dataclass
@@ -82,6 +87,10 @@ def learn(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> Concept:
     pixels (h, w, 3) float32, perceptually encoded, 0 to 1; mask (h, w) bool, the region.
     Raises PaletteError when too few patches of PATCH x PATCH px lie in the region.
     """
+    return Concept(pixels, mask, find_periods(pixels, mask), _levels(pixels, mask, progress))
+
+
+def _levels(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> list[Level]:
     side = math.sqrt(mask.sum())
     count = 1 + max(0, round(math.log2(max(1.0, side / COARSEST))))
     step = 2 ** (count - 1)
@@ -101,7 +110,7 @@ def learn(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> Concept:
         raise PaletteError(
             f"the region holds too few patches of {PATCH} x {PATCH} px; paint a wider area or use a larger photo"
         )
-    return Concept(levels, find_periods(pixels, mask))
+    return levels
 
 
 def _level(colour: torch.Tensor, weight: torch.Tensor) -> Level | None:
@@ -144,13 +153,15 @@ def sample(
     """
     coarse_rounds, finest_rounds = ROUNDS[quality]
     generator = torch.Generator().manual_seed(seed)
+    stretch, counts = _whole_periods(concept.periods, size)
+    levels = concept.levels if stretch == (1.0, 1.0) else _stretched(concept, stretch)
     sizes = [size]
-    while len(sizes) < len(concept.levels) and min(sizes[-1]) >= 8 * PATCH:
+    while len(sizes) < len(levels) and min(sizes[-1]) >= 8 * PATCH:
         sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
-    levels = concept.levels[: len(sizes)]
+    levels = levels[: len(sizes)]
     rounds = [coarse_rounds if i else finest_rounds for i in range(len(sizes))]
     work = [h * w * n for (h, w), n in zip(sizes, rounds, strict=True)]
-    phases = [_Phases(concept.periods, level, size, sizes[0]) for level, size in zip(levels, sizes, strict=True)]
+    phases = [_Phases(counts, level, size) for level, size in zip(levels, sizes, strict=True)]
     done = 0.0
 
     def report(fraction: float) -> None:
@@ -174,7 +185,8 @@ def sample(
         share = 0
         image = _vote(levels[0], coordinates, pool, report)
     columns = levels[0].shape[1]
-    coordinates = torch.stack([coordinates // columns, coordinates % columns], -1)
+    coordinates = torch.stack([coordinates // columns / stretch[0], coordinates % columns / stretch[1]], -1).long()
+    coordinates = coordinates.clamp_max(torch.tensor(concept.mask.shape) - 1)
     shift = _calmest(image)
     return Texture(image.roll(shift, (0, 1)).numpy(), coordinates.roll(shift, (0, 1)).numpy())
 
@@ -186,27 +198,40 @@ def _calmest(image: torch.Tensor) -> tuple[int, int]:
     return -int(rows.argmin()), -int(columns.argmin())
 
 
+def _whole_periods(periods, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[int, int]]:
+    """How much to stretch the exemplar along each axis so that a whole number of its periods fills the tile, and that
+    number; 1 and 0 along an axis without a period, or where too few fit to get there with a small stretch."""
+    stretch, counts = [1.0, 1.0], [0, 0]
+    for axis, period in enumerate(periods):
+        count = round(size[axis] / period) if period else 0
+        if count and abs(size[axis] / (count * period) - 1) <= MOST_STRETCH:
+            stretch[axis], counts[axis] = size[axis] / (count * period), count
+    return tuple(stretch), tuple(counts)
+
+
+def _stretched(concept: Concept, stretch: tuple[float, float]) -> list[Level]:
+    h, w = concept.mask.shape
+    size = max(1, round(w * stretch[1])), max(1, round(h * stretch[0]))
+    pixels = np.clip(cv2.resize(concept.pixels, size, interpolation=cv2.INTER_CUBIC), 0, 1)
+    mask = cv2.resize(concept.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return _levels(pixels, mask, lambda fraction, message: None)
+
+
 class _Phases:
-    """How far a source is out of step with the place it would fill, along the axes in which the exemplar repeats.
+    """How far a source is out of step with the place it would fill, along the axes in which the exemplar repeats."""
 
-    The texture's period is the exemplar's, stretched a little so that a whole number fits the tile.
-    """
-
-    def __init__(self, periods, level: Level, size: tuple[int, int], full_size: tuple[int, int]):
-        self.axes = []
-        for axis, period in enumerate(periods):
-            count = round(full_size[axis] / period) if period else 0
-            own = period * size[axis] / full_size[axis] if period else 0.0
-            if count and own >= SHORTEST_PERIOD:
-                self.axes.append((axis, 2 * math.pi / own, 2 * math.pi * count / size[axis]))
+    def __init__(self, counts: tuple[int, int], level: Level, size: tuple[int, int]):
+        # a level too coarse to tell the phase is left alone
+        steps = [(axis, 2 * math.pi * counts[axis] / size[axis]) for axis in (0, 1)]
+        self.axes = [(axis, step) for axis, step in steps if 0 < step <= 2 * math.pi / SHORTEST_PERIOD]
         self.stride = level.shape[1]
 
     def misfit(self, source: torch.Tensor, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor | float:
         """0 in phase to 2 in opposition, per axis; source are flattened coordinates, y and x rows and columns."""
         total = 0.0
-        for axis, exemplar, texture in self.axes:
-            position = source % self.stride if axis else source // self.stride
-            total = total + 1 - torch.cos(position * exemplar - (x if axis else y) * texture)
+        for axis, step in self.axes:
+            offset = source % self.stride - x if axis else source // self.stride - y
+            total = total + 1 - torch.cos(offset * step)
         return total
 
 
@@ -372,21 +397,21 @@ def _search(level: Level, image, before, phases: _Phases, seed: int, pool: Threa
         generator = torch.Generator().manual_seed(seed + number)
         for reach in REACHES:
             jump = torch.randint(-reach, reach + 1, (2, len(current)), generator=generator)
-            _improve(level, cost_of, current, cost, current + jump[0] * stride + jump[1])
+            _improve(level, cost_of, current, cost, current + jump[0] * stride + jump[1], COHERENCE)
         after[top:end] = current.reshape(-1, w)
 
     _each_band((h, w), search, pool, report)
     return after
 
 
-def _improve(level: Level, cost_of: Callable, current: torch.Tensor, cost: torch.Tensor, candidate) -> None:
-    """Takes the candidate sources that are better, in place."""
+def _improve(level: Level, cost_of: Callable, current: torch.Tensor, cost: torch.Tensor, candidate, margin=1.0) -> None:
+    """Takes the candidate sources that cost less than `margin` of the current ones, in place."""
     ok = (candidate != current) & (candidate >= 0) & (candidate < len(level.valid))
     where = ok.nonzero()[:, 0]
     where = where[level.valid[candidate[where]]]
     source = candidate[where]
     found = cost_of(where, source)
-    better = found < cost[where]
+    better = found < margin * cost[where]
     where = where[better]
     current[where] = source[better]
     cost[where] = found[better]
