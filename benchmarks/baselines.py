@@ -43,7 +43,7 @@ def offset_poisson(pixels, mask, size, seed):
     """The square is rolled by half; the seam, now in the middle, is covered by the square's own middle strip.
 
     One axis after the other, so that the strip wraps along the seam. Blended after Perez et al. 2003: the strip plus
-    the harmonic function that makes its two sides meet what they border on, in closed form by a Fourier series along it.
+    the harmonic function that makes its sides meet what they border on, in closed form by a Fourier series along it.
     """
     tile = pixels[largest_square(mask)]
     for axis in (1, 0):
