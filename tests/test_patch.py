@@ -27,6 +27,17 @@ def test_same_seed_same_texture_and_another_seed_another():
     assert np.abs(first - other).mean() > 0.05
 
 
+def test_the_number_of_cores_and_their_timing_do_not_show(monkeypatch):
+    exemplar = pebbles(100, 100)
+    # bands of a few rows: many are searched side by side
+    monkeypatch.setattr(patch, "BAND", 1500)
+    monkeypatch.setattr(patch.os, "cpu_count", lambda: 1)
+    alone = synthesise(exemplar, quality="balanced").coordinates
+    monkeypatch.setattr(patch.os, "cpu_count", lambda: 4)
+    for _ in range(3):
+        assert np.array_equal(synthesise(exemplar, quality="balanced").coordinates, alone)
+
+
 @pytest.mark.parametrize("size", [(64, 64), (67, 130), (300, 90)])
 def test_any_size(size):
     texture = synthesise(pebbles(80, 110), size=size)

@@ -169,7 +169,7 @@ def sample(
 
     share = 0
     coordinates = _quilt(levels[-1], sizes[-1], phases[-1], generator, report)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
         for i in reversed(range(len(levels))):
             level = levels[i]
             if i < len(levels) - 1:
@@ -376,7 +376,8 @@ def _search(level: Level, image, before, phases: _Phases, seed: int, pool: Threa
 
     def search(number: int, top: int, end: int) -> None:
         target = target_of(top, end)
-        current = before[top:end].flatten()
+        # a copy: the bands beside this one read the rows of `before`
+        current = before[top:end].flatten().clone()
         above, below = before[top - 1], before[end % h]
 
         def cost_of(where: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
