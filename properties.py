@@ -35,8 +35,100 @@ def _show_active_mask(settings, context):
     follow_active_region(settings, context)
 
 
+def _show_region_of_material(settings, context):
+    entry = settings.palette[settings.active_material] if settings.active_material < len(settings.palette) else None
+    for index, region in enumerate(settings.regions):
+        if entry and region.key == entry.key and settings.active_region != index:
+            settings.active_region = index
+
+
+def _control(name):
+    """get and set of a property that is the material's node tree itself: undo, scripts and hand-made edits agree."""
+
+    def get(group):
+        from .core.nodes import Controls
+
+        value = getattr(Controls(group.id_data), name)
+        return 0.0 if value is None else value
+
+    def set_(group, value):
+        from .core.nodes import Controls
+
+        setattr(Controls(group.id_data), name, value)
+
+    return {"get": get, "set": set_}
+
+
+def _relief(name):
+    from .core.nodes import RELIEFS, Controls
+
+    return {
+        "get": lambda group: RELIEFS.index(Controls(group.id_data).relief),
+        "set": lambda group, value: setattr(Controls(group.id_data), name, RELIEFS[value]),
+    }
+
+
+class MATERIAL_PALETTE_PG_controls(PropertyGroup):
+    """What an artist adjusts on an extracted material; nothing is stored here, all of it is in the node tree."""
+
+    tile_size: FloatProperty(
+        name="Tile Size",
+        description="How wide one repeat of the texture is on a surface whose UV map is in metres",
+        min=0.001,
+        soft_max=100.0,
+        unit="LENGTH",
+        **_control("tile_size"),
+    )
+    rotation: FloatProperty(
+        name="Rotation", description="Turn of the texture on the surface", subtype="ANGLE", **_control("rotation")
+    )
+    relief: EnumProperty(
+        name="Relief",
+        description="How the surface's relief is made",
+        items=(
+            ("NORMAL", "Normal Map", "Shade the relief by the normal map; works on any mesh and in any renderer"),
+            ("BUMP", "Bump", "Shade the relief by the height map; its depth is in real metres"),
+            ("DISPLACEMENT", "Displacement", "Move the surface by the height map; needs a finely subdivided mesh"),
+        ),
+        **_relief("relief"),
+    )
+    strength: FloatProperty(
+        name="Relief Strength",
+        description="Factor on the normal map's slope or on the height",
+        min=0.0,
+        soft_max=2.0,
+        max=10.0,
+        **_control("strength"),
+    )
+    roughness_offset: FloatProperty(
+        name="Roughness Offset",
+        description="Added to the roughness map: below 0 glossier, above 0 duller",
+        min=-1.0,
+        max=1.0,
+        **_control("roughness_offset"),
+    )
+    hue: FloatProperty(
+        name="Hue",
+        description="Turn of the base colour's hue; 0.5 leaves it as it is",
+        min=0.0,
+        max=1.0,
+        **_control("hue"),
+    )
+    saturation: FloatProperty(
+        name="Saturation",
+        description="Factor on the base colour's saturation",
+        min=0.0,
+        max=2.0,
+        **_control("saturation"),
+    )
+    brightness: FloatProperty(
+        name="Brightness", description="Factor on the base colour", min=0.0, max=2.0, **_control("brightness")
+    )
+
+
 class MATERIAL_PALETTE_PG_region(PropertyGroup):
     # `name` comes with every PropertyGroup and becomes the material's name
+    key: IntProperty(options={"HIDDEN"})  # what ties a material to its region, whatever either is called
     mask: PointerProperty(name="Mask", type=Image, description="White where the region is, the size of the photo")
     colour: FloatVectorProperty(
         name="Colour",
@@ -47,6 +139,8 @@ class MATERIAL_PALETTE_PG_region(PropertyGroup):
         description="Colour of the region over the photo",
     )
     enabled: BoolProperty(name="Extract", default=True, description="Extract a material from this region")
+    visible: BoolProperty(name="Visible", default=True, description="Show the region over the photo")
+    error: StringProperty(name="Error", description="Why no material could be made of the region the last time")
     automatic: BoolProperty(
         name="Automatic",
         description="Found by Auto Segment, which replaces it the next time it runs; painting keeps it",
@@ -54,8 +148,11 @@ class MATERIAL_PALETTE_PG_region(PropertyGroup):
 
 
 class MATERIAL_PALETTE_PG_extracted(PropertyGroup):
-    # `name` is the region's name
+    # `name` is the region's name when the material was made
+    key: IntProperty(options={"HIDDEN"})
     material: PointerProperty(name="Material", type=Material)
+    previous: PointerProperty(name="Before", type=Material, description="The material that this one took the place of")
+    seed: IntProperty(name="Seed", description="The seed that this material was made with")
     warnings: StringProperty(name="Warnings", description="What went less well than it could, one per line")
 
 
@@ -107,7 +204,12 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
     overwrite: BoolProperty(name="Overwrite", description="Replace what the output folder holds")
 
     palette: CollectionProperty(type=MATERIAL_PALETTE_PG_extracted)
-    active_material: IntProperty(name="Active Material", min=0, options={"SKIP_SAVE"})
+    active_material: IntProperty(name="Active Material", min=0, options={"SKIP_SAVE"}, update=_show_region_of_material)
+    palette_view: EnumProperty(
+        name="View",
+        description="How the palette is shown",
+        items=(("GRID", "Grid", "Large previews", "IMGDISPLAY", 0), ("LIST", "List", "Names", "LONGDISPLAY", 1)),
+    )
 
 
 def _run(attribute):
@@ -130,6 +232,7 @@ class MATERIAL_PALETTE_PG_run(PropertyGroup):
 
 
 _CLASSES = (
+    MATERIAL_PALETTE_PG_controls,
     MATERIAL_PALETTE_PG_region,
     MATERIAL_PALETTE_PG_extracted,
     MATERIAL_PALETTE_PG_settings,
@@ -141,11 +244,13 @@ def register():
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.material_palette = PointerProperty(type=MATERIAL_PALETTE_PG_settings)
+    bpy.types.Material.material_palette = PointerProperty(type=MATERIAL_PALETTE_PG_controls)
     bpy.types.WindowManager.material_palette_run = PointerProperty(type=MATERIAL_PALETTE_PG_run)
 
 
 def unregister():
     del bpy.types.WindowManager.material_palette_run
+    del bpy.types.Material.material_palette
     del bpy.types.Scene.material_palette
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)

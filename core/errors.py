@@ -1,4 +1,4 @@
-"""The two ways a run ends early."""
+"""The ways a run ends early."""
 
 
 class PaletteError(Exception):
@@ -7,3 +7,7 @@ class PaletteError(Exception):
 
 class Cancelled(Exception):
     """The user asked to stop; raised by the progress callback, never shown as a failure."""
+
+
+class Abandoned(Cancelled):
+    """Whoever would take the result is gone: nothing is kept, not even what is finished."""

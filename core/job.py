@@ -8,7 +8,7 @@ import queue
 import threading
 import time
 
-from .errors import Cancelled
+from .errors import Abandoned, Cancelled
 
 # A forecast from less than this is noise.
 _LEAST_SECONDS = 1.0
@@ -27,6 +27,7 @@ class Job:
         self._work = work
         self._events = queue.SimpleQueue()
         self._cancel = threading.Event()
+        self._abandoned = False
         self._thread = threading.Thread(target=self._run, name="material_palette", daemon=True)
         self._started = None
         self.fraction = 0.0
@@ -37,6 +38,11 @@ class Job:
         self._thread.start()
 
     def cancel(self):
+        self._cancel.set()
+
+    def abandon(self):
+        """Cancel, and tell the work that nobody will take what it has finished."""
+        self._abandoned = True
         self._cancel.set()
 
     @property
@@ -91,4 +97,4 @@ class Job:
 
     def _stop_if_cancelled(self):
         if self._cancel.is_set():
-            raise Cancelled
+            raise Abandoned if self._abandoned else Cancelled

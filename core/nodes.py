@@ -1,7 +1,8 @@
 """Principled BSDF materials from the records of palette.json; the one module of core that touches Blender.
 
 UV -> one Mapping (one scale for all maps) -> Image Textures -> Principled BSDF. A map that is a value becomes the
-socket's value and no node. Everything runs on Blender's main thread.
+socket's value and no node. `Controls` changes a material afterwards by its nodes alone: what is at its default has no
+node. Everything runs on Blender's main thread.
 """
 
 from pathlib import Path
@@ -19,9 +20,33 @@ PREVIEW_SIZE = 256
 _ICON_SIZE = 32
 
 # Left edge of each column and height of an Image Texture's row, from the nodes' drawn sizes in Blender 4.2 to 5.2.
-_COLUMN = {"coordinate": -1180, "mapping": -960, "image": -660, "normal": -320, "principled": -60, "output": 300}
+_COLUMN = {
+    "coordinate": -1430,
+    "mapping": -1210,
+    "image": -910,
+    "adjust": -580,
+    "normal": -320,
+    "principled": -60,
+    "output": 300,
+}
 _ROW = 320
 _LABELS = {"basecolor": "Base Color", "normal": "Normal", "roughness": "Roughness"}
+# `Controls` finds nodes by these names, which the file keeps; labels and places are the artist's.
+_NAMES = {
+    "mapping": "Palette Mapping",
+    "basecolor": "Palette Base Color",
+    "normal": "Palette Normal",
+    "roughness": "Palette Roughness",
+    "height": "Palette Height",
+    "normal map": "Palette Normal Map",
+    "principled": "Palette Principled",
+    "output": "Palette Output",
+    "colour": "Palette Colour Adjustment",
+    "offset": "Palette Roughness Offset",
+    "turn": "Palette Normal Rotation",
+    "displacement": "Palette Displacement",
+}
+RELIEFS = ("NORMAL", "BUMP", "DISPLACEMENT")
 
 
 def build_material(record, folder, *, pack, preview=None):
@@ -29,9 +54,9 @@ def build_material(record, folder, *, pack, preview=None):
 
     record: one "ok" entry of palette.json["materials"]. folder: what the record's files are relative to. pack: store
     the files in the .blend, else refer to them. preview: (256, 256, 4) float32 sRGB-encoded RGBA, top row first, or
-    None. The height map gets no node: it rides along as the custom properties "height" (image), "height_scale" (tile
-    widths) and "height_midlevel", for whoever wants displacement. Raises PaletteError for a failed record, a file that
-    is missing and a constant normal that isn't flat; what was built until then is removed.
+    None. The height map gets no node until `Controls.relief` asks for it: it rides along as the custom properties
+    "height" (image), "height_scale" (tile widths) and "height_midlevel". Raises PaletteError for a failed record, a
+    file that is missing and a constant normal that isn't flat; what was built until then is removed.
     """
     if record["status"] != "ok":
         raise PaletteError(f"material '{record['name']}' failed, there is nothing to build: {record['error']}")
@@ -79,9 +104,20 @@ def mark_asset(material, description):
 
 def images_of(material):
     """Return the images `material` uses, the height map with them, each once."""
-    images = [node.image for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeTexImage"]
+    nodes = material.node_tree.nodes if material.node_tree else ()
+    images = [node.image for node in nodes if node.bl_idname == "ShaderNodeTexImage"]
     images.append(material.get("height"))
     return list(dict.fromkeys(image for image in images if image is not None))
+
+
+def move_files(material, old, new):
+    """Point the images of `material` to the folder `new` where they lay in `old`; the files are there already."""
+    for image in images_of(material):
+        path = Path(bpy.path.abspath(image.filepath_raw))
+        if path.is_relative_to(old):
+            image.filepath_raw = _relative(str(Path(new) / path.relative_to(old)))
+            if not image.has_data:
+                image.reload()
 
 
 def remove_material(material):
@@ -91,6 +127,197 @@ def remove_material(material):
     for image in images:
         if image.users == 0:
             bpy.data.images.remove(image)
+
+
+class Controls:
+    """What an artist adjusts on a finished material, read from its node tree and written into it.
+
+    `tile_size` in metres (None for a material of constants), `rotation` in radians, `relief` one of RELIEFS, `strength`
+    of the relief (1 is as extracted), `roughness_offset` in [-1, 1], `hue` in [0, 1] (0.5 is as extracted),
+    `saturation` and `brightness` factors. Reading a control whose node is missing gives its default; setting it does
+    nothing where the tree lacks what it would act on. `bool(Controls(material))` is whether build_material made it.
+    """
+
+    DEFAULTS = {
+        "rotation": 0.0,
+        "relief": "NORMAL",
+        "strength": 1.0,
+        "roughness_offset": 0.0,
+        "hue": 0.5,
+        "saturation": 1.0,
+        "brightness": 1.0,
+    }
+
+    def __init__(self, material):
+        self._material = material
+        self._tree = material.node_tree
+
+    def __bool__(self):
+        return self.node("principled") is not None
+
+    def node(self, name):
+        """The node that build_material or a control has named so, or None."""
+        return self._tree.nodes.get(_NAMES[name]) if self._tree else None
+
+    def values(self):
+        """All controls by name, the tile's size among them when there is one."""
+        names = [*self.DEFAULTS, *(["tile_size"] if self.tile_size else [])]
+        return {name: getattr(self, name) for name in names}
+
+    def set(self, values):
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    def reset(self):
+        """Back to what was extracted."""
+        self.set(self.DEFAULTS)
+        if self.tile_size:
+            self.tile_size = self._material.get("metres_per_tile", 1.0)
+
+    @property
+    def tile_size(self):
+        mapping = self.node("mapping")
+        scale = mapping.inputs["Scale"].default_value[0] if mapping else 0.0
+        return 1.0 / scale if scale else None
+
+    @tile_size.setter
+    def tile_size(self, metres):
+        mapping, strength = self.node("mapping"), self.strength
+        if mapping:
+            mapping.inputs["Scale"].default_value = (1.0 / metres,) * 3
+            self.strength = strength  # displacement is in metres: it follows the tile
+
+    @property
+    def rotation(self):
+        mapping = self.node("mapping")
+        return mapping.inputs["Rotation"].default_value[2] if mapping else 0.0
+
+    @rotation.setter
+    def rotation(self, angle):
+        mapping = self.node("mapping")
+        if not mapping:
+            return
+        mapping.inputs["Rotation"].default_value[2] = angle
+        # The mapping turns where a texel is read; the directions that a normal map holds have to turn with the picture.
+        turn = self._between("turn", "ShaderNodeVectorRotate", "normal", ("normal map", "Color"), abs(angle) > 1e-6)
+        if turn:
+            turn.rotation_type = "Z_AXIS"
+            turn.inputs["Center"].default_value = (0.5, 0.5, 0.5)
+            turn.inputs["Angle"].default_value = -angle
+
+    @property
+    def relief(self):
+        if self.node("displacement") is None:
+            return "NORMAL"
+        return "BUMP" if self._material.displacement_method == "BUMP" else "DISPLACEMENT"
+
+    @relief.setter
+    def relief(self, relief):
+        """NORMAL: the normal map. BUMP, DISPLACEMENT: the height map instead, since both tell of the same relief."""
+        strength, output, bend = self.strength, self.node("output"), self.node("normal map")
+        links = self._tree.links
+        if relief != "NORMAL" and not (self._material.get("height") and output and self.node("mapping")):
+            return
+        self._material.displacement_method = {"NORMAL": "BUMP", "BUMP": "BUMP", "DISPLACEMENT": "BOTH"}[relief]
+        if relief == "NORMAL":
+            for name in ("displacement", "height"):
+                if self.node(name):
+                    self._tree.nodes.remove(self.node(name))
+            if bend:
+                links.new(bend.outputs["Normal"], self.node("principled").inputs["Normal"])
+        elif self.node("displacement") is None:
+            image = _node(self._tree, "ShaderNodeTexImage", "image", 3, "Height", name="height")
+            image.image = self._material["height"]
+            links.new(self.node("mapping").outputs["Vector"], image.inputs["Vector"])
+            raise_ = _node(self._tree, "ShaderNodeDisplacement", "normal", 3, name="displacement")
+            raise_.inputs["Midlevel"].default_value = self._material["height_midlevel"]
+            links.new(image.outputs["Color"], raise_.inputs["Height"])
+            links.new(raise_.outputs["Displacement"], output.inputs["Displacement"])
+            for link in [*self.node("principled").inputs["Normal"].links]:
+                links.remove(link)
+        self.strength = strength
+
+    @property
+    def strength(self):
+        bend, raise_ = self.node("normal map"), self.node("displacement")
+        if raise_:
+            return raise_.inputs["Scale"].default_value / max(self._relief_metres(), 1e-12)
+        return bend.inputs["Strength"].default_value if bend else 1.0
+
+    @strength.setter
+    def strength(self, strength):
+        bend, raise_ = self.node("normal map"), self.node("displacement")
+        if bend:
+            bend.inputs["Strength"].default_value = strength
+        if raise_:
+            raise_.inputs["Scale"].default_value = strength * self._relief_metres()
+
+    def _relief_metres(self):
+        return self._material.get("height_scale", 0.0) * (self.tile_size or 1.0)
+
+    @property
+    def roughness_offset(self):
+        node = self.node("offset")
+        return node.inputs[1].default_value if node else 0.0
+
+    @roughness_offset.setter
+    def roughness_offset(self, offset):
+        node = self._between("offset", "ShaderNodeMath", "roughness", ("principled", "Roughness"), abs(offset) > 1e-6)
+        if node:
+            node.operation, node.use_clamp = "ADD", True
+            node.inputs[1].default_value = offset
+
+    @property
+    def hue(self):
+        return self._colour("Hue", 0.5)
+
+    @hue.setter
+    def hue(self, hue):
+        self._set_colour(hue, self.saturation, self.brightness)
+
+    @property
+    def saturation(self):
+        return self._colour("Saturation", 1.0)
+
+    @saturation.setter
+    def saturation(self, saturation):
+        self._set_colour(self.hue, saturation, self.brightness)
+
+    @property
+    def brightness(self):
+        return self._colour("Value", 1.0)
+
+    @brightness.setter
+    def brightness(self, brightness):
+        self._set_colour(self.hue, self.saturation, brightness)
+
+    def _colour(self, socket, default):
+        node = self.node("colour")
+        return node.inputs[socket].default_value if node else default
+
+    def _set_colour(self, hue, saturation, brightness):
+        changed = max(abs(hue - 0.5), abs(saturation - 1.0), abs(brightness - 1.0)) > 1e-6
+        node = self._between("colour", "ShaderNodeHueSaturation", "basecolor", ("principled", "Base Color"), changed)
+        if node:
+            for socket, value in (("Hue", hue), ("Saturation", saturation), ("Value", brightness)):
+                node.inputs[socket].default_value = value
+
+    def _between(self, name, idname, source, target, wanted):
+        """The node `name` on the way from the Image Texture `source` to `target` (node, input), made when it is wanted
+        and removed when it isn't; None when it isn't there, as without that texture."""
+        node, image, end = self.node(name), self.node(source), self.node(target[0])
+        if node is None and wanted and image and end:
+            node = _node(self._tree, idname, "adjust", 0, name=name)
+            node.location.y = image.location.y
+            entrance = "Color" if idname == "ShaderNodeHueSaturation" else 0
+            self._tree.links.new(image.outputs["Color"], node.inputs[entrance])
+            self._tree.links.new(node.outputs[0], end.inputs[target[1]])
+        elif node and not wanted:
+            self._tree.nodes.remove(node)
+            if image and end:
+                self._tree.links.new(image.outputs["Color"], end.inputs[target[1]])
+            node = None
+        return node
 
 
 def write_blend(path, palette_json, folder, previews, *, pack):
@@ -141,8 +368,9 @@ def _build_tree(material, record, folder, pack, images):
         material.use_nodes = True
     tree = material.node_tree
     tree.nodes.clear()
-    principled = _node(tree, "ShaderNodeBsdfPrincipled", "principled", 0)
-    output = _node(tree, "ShaderNodeOutputMaterial", "output", 0)
+    principled = _node(tree, "ShaderNodeBsdfPrincipled", "principled", 0, name="principled")
+    output = _node(tree, "ShaderNodeOutputMaterial", "output", 0, name="output")
+    material["metres_per_tile"] = float(record["metres_per_tile"])
     tree.links.new(principled.outputs["BSDF"], output.inputs["Surface"])
     textures = {}
     for role, map_ in record["maps"].items():
@@ -170,13 +398,13 @@ def _set_constant(principled, role, value, name):
 
 def _wire_textures(tree, principled, textures, metres_per_tile):
     coordinate = _node(tree, "ShaderNodeTexCoord", "coordinate", 0)
-    mapping = _node(tree, "ShaderNodeMapping", "mapping", 0, "Scale of all maps")
+    mapping = _node(tree, "ShaderNodeMapping", "mapping", 0, "Scale of all maps", name="mapping")
     mapping.inputs["Scale"].default_value = (1.0 / metres_per_tile,) * 3
     tree.links.new(coordinate.outputs["UV"], mapping.inputs["Vector"])
-    _frame(tree, f"One tile is {metres_per_tile:g} m", (coordinate, mapping))
+    _frame(tree, "Size of a tile", (coordinate, mapping))
     nodes = []
     for row, role in enumerate(role for role in _LABELS if role in textures):
-        node = _node(tree, "ShaderNodeTexImage", "image", row, _LABELS[role])
+        node = _node(tree, "ShaderNodeTexImage", "image", row, _LABELS[role], name=role)
         node.image = textures[role]
         tree.links.new(mapping.outputs["Vector"], node.inputs["Vector"])
         nodes.append(node)
@@ -185,17 +413,19 @@ def _wire_textures(tree, principled, textures, metres_per_tile):
         elif role == "roughness":
             tree.links.new(node.outputs["Color"], principled.inputs["Roughness"])
         else:
-            bend = _node(tree, "ShaderNodeNormalMap", "normal", row)
+            bend = _node(tree, "ShaderNodeNormalMap", "normal", row, name="normal map")
             tree.links.new(node.outputs["Color"], bend.inputs["Color"])
             tree.links.new(bend.outputs["Normal"], principled.inputs["Normal"])
             nodes.append(bend)
     _frame(tree, "Maps", nodes)
 
 
-def _node(tree, idname, column, row, label=""):
+def _node(tree, idname, column, row, label="", name=None):
     node = tree.nodes.new(idname)
     node.location = (_COLUMN[column], -row * _ROW)
     node.label = label
+    if name:
+        node.name = _NAMES[name]
     node.select = False
     return node
 
@@ -231,9 +461,15 @@ def _load(folder, file, pack, *, data):
         # where the texture lay when it was packed is nobody's business and may be gone: unpack beside the .blend
         image.filepath_raw = f"//{file}"
         image.packed_files[0].filepath = f"//{file}"
-    elif bpy.data.filepath:
-        try:
-            image.filepath_raw = bpy.path.relpath(image.filepath_raw)
-        except ValueError:  # another drive of Windows: only an absolute path leads there
-            pass
+    else:
+        image.filepath_raw = _relative(image.filepath_raw)
     return image
+
+
+def _relative(path):
+    if not bpy.data.filepath:
+        return path
+    try:
+        return bpy.path.relpath(path)
+    except ValueError:  # another drive of Windows: only an absolute path leads there
+        return path

@@ -226,13 +226,22 @@ def write_material(material: Material, folder: Path) -> dict:
     return record
 
 
-def write_palette(palette: Palette, folder: Path, progress: Progress = lambda fraction, message: None) -> dict:
-    """Write maps, masks/, palette.json and palette.png into an empty folder; return what palette.json holds."""
+def write_palette(
+    palette: Palette,
+    folder: Path,
+    progress: Progress = lambda fraction, message: None,
+    written: dict[str, dict] | None = None,
+) -> dict:
+    """Write maps, masks/, palette.json and palette.png into an empty folder; return what palette.json holds.
+
+    written: records, by name, of materials that `write_material` has put into the folder already.
+    """
     start = time.perf_counter()
     records = []
     for i, material in enumerate(palette.materials):
         progress(0.8 * i / len(palette.materials), f"writing {material.name}")
-        records.append(write_material(material, folder / file_name(material.name)))
+        record = (written or {}).get(material.name)
+        records.append(record or write_material(material, folder / file_name(material.name)))
     (folder / "masks").mkdir()
     for region in palette.regions:
         write_image(folder / "masks" / f"{file_name(region.name)}.png", region.mask.astype(np.float32))

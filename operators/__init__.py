@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import assign, background, extract, photo, regions, segment, setup
+from . import assign, background, extract, history, palette, photo, regions, segment, setup
 
-_MODULES = (setup, photo, regions, background, segment, extract, assign)
+_MODULES = (setup, photo, regions, background, segment, extract, palette, assign)
 
 
 def register():
@@ -18,6 +18,7 @@ def register():
 def unregister():
     background.stop()
     background.forget()
+    history.forget()
     bpy.app.handlers.save_pre.remove(regions.pack_masks_before_save)
     bpy.app.handlers.load_pre.remove(background.stop_before_load)
     for module in reversed(_MODULES):

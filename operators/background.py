@@ -51,11 +51,14 @@ def state():
 
 def time_left(seconds):
     """`seconds` as a person says it; empty while unknown (negative)."""
-    if seconds < 0:
-        return ""
+    return "" if seconds < 0 else f"{duration(seconds)} left"
+
+
+def duration(seconds):
+    """`seconds` as a person says it."""
     if seconds < 60:
-        return f"{max(1, round(seconds))} s left"
-    return f"{int(seconds // 60)} min {int(seconds % 60):02d} s left"
+        return f"{max(1, round(seconds))} s"
+    return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
 
 
 def cancel():
@@ -70,7 +73,7 @@ def stop():
     if _current is None:
         return
     run, _current = _current, None
-    run.job.cancel()
+    run.job.abandon()
     run.job.join(_LONGEST_STOP)
     for event in run.job.events():
         if event[0] == "done":
@@ -101,8 +104,9 @@ class BackgroundOperator:
     """Mixin of an operator whose work runs on a `Job`.
 
     A subclass gives `prepare(context) -> work` (reads everything from bpy; `work(progress, send)` never touches it),
-    `finish(context, scene, result)` (writes to bpy, may raise PaletteError) and `discard(result)`, a static method that
-    removes what a result that nobody wants has left on disk.
+    `receive(context, scene, value)` (takes what the work sends on its way; must not raise), `finish(context, scene,
+    result)` (writes to bpy, may raise PaletteError) and `discard(result)`, a static method that removes what a result
+    that nobody wants has left on disk.
     """
 
     bl_options = {"REGISTER", "UNDO"}
@@ -115,6 +119,9 @@ class BackgroundOperator:
         if sentence:
             cls.poll_message_set(sentence)
         return not sentence
+
+    def receive(self, context, scene, value):
+        pass
 
     @staticmethod
     def discard(result):
@@ -186,7 +193,13 @@ class BackgroundOperator:
         """Take the events; return the operator's result once the work has ended, else None."""
         global _current
         for event in _current.job.events():
-            if event[0] in {"progress", "sent"}:
+            if event[0] == "progress":
+                continue
+            if event[0] == "sent":
+                scene = _scene(_current)
+                if scene is not None:
+                    self.receive(context, scene, event[1])
+                    _current.shown = 0.0
                 continue
             run, _current = _current, None
             run.job.join()
@@ -204,8 +217,7 @@ class BackgroundOperator:
             self._fail(str(value) if isinstance(value, PaletteError) else f"{type(value).__name__}: {value}")
             return {"CANCELLED"}
         try:
-            # undo and renaming keep this number, another file never has it
-            scene = next((s for s in bpy.data.scenes if s.session_uid == run.scene_uid), None)
+            scene = _scene(run)
             if scene is None:
                 raise PaletteError("The scene that this was for is gone; nothing was added")
             self.finish(context, scene, value)
@@ -215,6 +227,11 @@ class BackgroundOperator:
         finally:
             self.discard(value)
         return {"FINISHED"}
+
+
+def _scene(run):
+    """The scene that the run was started for: undo and renaming keep its number, another file never has it."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == run.scene_uid), None)
 
 
 def _print_traceback(error):
@@ -252,7 +269,7 @@ def _clear_interface(run):
 
 
 class MATERIAL_PALETTE_OT_cancel(Operator):
-    """Stop what Material Palette is doing; nothing of it is kept"""
+    """Stop what Material Palette is doing; the materials that are finished are kept"""
 
     bl_idname = "material_palette.cancel"
     bl_label = "Cancel"

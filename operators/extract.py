@@ -1,17 +1,21 @@
-"""Extract Palette: the enabled regions of the photo become materials, on a background thread."""
+"""Extract Palette: the enabled regions of the photo become materials, on a background thread, one after the other."""
 
+import contextlib
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
+import traceback
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
 import numpy as np
 from bpy.types import Operator
 
-from ..core.errors import PaletteError
+from ..core.errors import Abandoned, Cancelled, PaletteError
+from . import history
 from .background import BackgroundOperator
+from .palette import active_entry, put_in_palette, region_of
 from .photo import photo_reader
 from .regions import read_mask_image
 
@@ -19,104 +23,210 @@ _EXTRACTION = 0.95  # share of the time; the rest is writing
 
 
 @dataclass
-class _Extracted:
-    """What the worker hands over: palette.json's dict, the folder of its files, previews by material name."""
+class _Made:
+    """One region's outcome: the region's key, its record as in palette.json, the folder of its files."""
 
-    palette: dict
+    key: int
+    record: dict
     folder: Path
-    previews: dict
+    preview: np.ndarray | None
+
+
+@dataclass
+class _Extracted:
+    """What the worker hands over at the end. folder: where the files are now; staging: where they were before."""
+
+    made: list[_Made]
+    folder: Path
+    staging: Path
     temporary: bool
+    cancelled: bool = False
 
 
-class MATERIAL_PALETTE_OT_extract(BackgroundOperator, Operator):
-    """Make a tileable material of every enabled region of the photo. Esc cancels"""
+@dataclass
+class _Order:
+    """What is wanted, read from the scene: photo, masks by region name, settings of core.palette."""
 
-    bl_idname = "material_palette.extract"
-    bl_label = "Extract Palette"
+    read: object
+    photo_name: str
+    masks: dict
+    keys: dict
+    chosen: dict
+    folder: Path | None
+    overwrite: bool
+    temporary: str | None
+    warnings: list = field(default_factory=list)
+
+
+class _Extracts(BackgroundOperator):
+    """Mixin: `regions(context)` names what to extract, `seed(context)` with what."""
 
     def prepare(self, context):
-        scene = context.scene.material_palette
-        chosen = {
-            "engine": scene.engine,
-            "quality": scene.quality,
-            "resolution": scene.resolution,
-            "seed": scene.seed,
-            "flatten": scene.flatten,
-            "metres_per_tile": scene.metres_per_tile,
-        }
-        read = photo_reader(scene.photo)
-        masks = _read_masks(scene)
-        photo_name = os.path.basename(scene.photo.filepath_raw) or scene.photo.name
-        if scene.pack:
-            folder, overwrite, tempdir = None, False, bpy.app.tempdir
-        else:
-            folder, overwrite, tempdir = _output_folder(scene), scene.overwrite, None
-            if folder.is_dir() and any(folder.iterdir()) and not overwrite:
-                raise PaletteError(f"Output folder isn't empty: {folder}. Choose another one, or turn on Overwrite")
-        self.pack = scene.pack
+        settings = context.scene.material_palette
+        order = _read_order(settings, self.regions(context), self.seed(context), self.is_whole)
+        self.pack = settings.pack
+        self.replaces_files = order.overwrite
+        self.chosen = order.chosen
+        self.photo_name = order.photo_name
+        self.built = {}  # region key: session_uid of its material
+        for region in settings.regions:
+            if region.key in order.keys.values():
+                region.error = ""
+        return lambda progress, send: _work(order, progress, send)
 
-        def work(progress, send):
-            # importing torch takes seconds, which the window shouldn't wait for
-            progress(0.0, "Getting ready")
-            from ..core.output import staged
-            from ..core.palette import Settings
+    def receive(self, context, scene, made):
+        # what can't be built now, as when the files are on their way to their folder, is built or named at the end
+        with contextlib.suppress(PaletteError, RuntimeError):
+            self._take(scene.material_palette, made)
 
-            settings = Settings(**chosen)
-            settings.check()
-            pixels, regions, warnings = _read_inputs(read, masks, progress)
-            if folder is not None:
-                with staged(folder, overwrite) as staging:
-                    palette, previews = _extract(pixels, regions, settings, progress, photo_name, warnings, staging)
-                return _Extracted(palette, folder, previews, temporary=False)
-            staging = Path(tempfile.mkdtemp(prefix="material_palette_", dir=tempdir))
-            try:
-                palette, previews = _extract(pixels, regions, settings, progress, photo_name, warnings, staging)
-            except BaseException:
-                shutil.rmtree(staging, ignore_errors=True)
-                raise
-            return _Extracted(palette, staging, previews, temporary=True)
+    def _take(self, settings, made):
+        """Put the material of `made` into the palette unless it is there: undo may have taken it back meanwhile."""
+        from ..core import nodes
 
-        return work
+        if made.record["status"] != "ok" or self.built.get(made.key) in {m.session_uid for m in bpy.data.materials}:
+            return
+        material = nodes.build_material(made.record, made.folder, pack=self.pack, preview=made.preview)
+        try:
+            nodes.mark_asset(material, f"Extracted from {self.photo_name}")
+        except BaseException:
+            nodes.remove_material(material)
+            raise
+        entry = put_in_palette(settings, made.key, material, not self.replaces_files)
+        entry.name = made.record["name"]
+        entry.seed = self.chosen["seed"]
+        entry.warnings = "\n".join(made.record["warnings"])
+        self.built[made.key] = material.session_uid
 
     def finish(self, context, scene, result):
         from ..core import nodes
 
-        records = result.palette["materials"]
-        failed = [record for record in records if record["status"] != "ok"]
-        if len(failed) == len(records):
+        settings = scene.material_palette
+        for material in bpy.data.materials:
+            if material.session_uid in self.built.values():
+                nodes.move_files(material, result.staging, result.folder)
+        for made in result.made:
+            made.folder = result.folder
+            try:
+                self._take(settings, made)
+            except Exception as error:
+                if not isinstance(error, PaletteError):
+                    traceback.print_exception(error)
+                made.record |= {"status": "failed", "error": str(error)}
+            region = region_of(settings, made.key)
+            if region is not None:
+                region.error = made.record["error"] or ""
+        failed = [made.record for made in result.made if made.record["status"] != "ok"]
+        if len(failed) == len(result.made):
             raise PaletteError("No material was made. " + _say(failed))
-        built = []
-        try:
-            for record in records:
-                if record["status"] == "ok":
-                    preview = result.previews.get(record["name"])
-                    material = nodes.build_material(record, result.folder, pack=self.pack, preview=preview)
-                    built.append((record, material))
-                    nodes.mark_asset(material, f"Extracted from {result.palette['photo']}")
-        except BaseException:
-            for _record, material in built:
-                nodes.remove_material(material)
-            raise
-        _replace_palette(scene.material_palette, built)
-        if failed:
-            self.report({"WARNING"}, f"{len(built)} materials made. " + _say(failed))
-        else:
-            self.report({"INFO"}, f"{len(built)} materials made")
+        history.add(self.chosen, [made.record for made in result.made])
+        said = f"{_count(len(result.made) - len(failed))} made"
+        if result.cancelled:
+            said = f"Cancelled: {_count(len(result.made) - len(failed))} finished before"
+        self.report({"WARNING"} if failed else {"INFO"}, ". ".join([said, *([_say(failed)] if failed else [])]))
 
     @staticmethod
     def discard(result):
         if result.temporary:
-            shutil.rmtree(result.folder, ignore_errors=True)
+            shutil.rmtree(result.staging, ignore_errors=True)
 
 
-def _read_masks(scene):
-    """The enabled regions' masks as {name: (H, W) bool}; raises PaletteError naming the region that can't be used."""
+class MATERIAL_PALETTE_OT_extract(_Extracts, Operator):
+    """Make a tileable material of every enabled region of the photo. Esc cancels and keeps what is finished"""
+
+    bl_idname = "material_palette.extract"
+    bl_label = "Extract Palette"
+
+    only_active: bpy.props.BoolProperty(
+        name="Only the Active Region", description="Extract the active region alone", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, context, properties):
+        return "Make a material of the active region alone. Esc cancels" if properties.only_active else cls.__doc__
+
+    @property
+    def is_whole(self):
+        return not self.only_active
+
+    def regions(self, context):
+        settings = context.scene.material_palette
+        if not self.only_active:
+            return [region for region in settings.regions if region.enabled]
+        return list(settings.regions)[settings.active_region :][:1]
+
+    def seed(self, context):
+        return context.scene.material_palette.seed
+
+
+class MATERIAL_PALETTE_OT_vary(_Extracts, Operator):
+    """Extract the active material anew with the next seed. It takes the place of the one before, which is kept to be
+    compared"""
+
+    bl_idname = "material_palette.vary"
+    bl_label = "Variation"
+
+    is_whole = False
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        settings = context.scene.material_palette
+        entry = active_entry(settings)
+        if entry is None or region_of(settings, entry.key) is None:
+            cls.poll_message_set(
+                "The region that this material came from is gone" if entry else "Extract a palette first"
+            )
+            return False
+        return True
+
+    def regions(self, context):
+        settings = context.scene.material_palette
+        return [region_of(settings, active_entry(settings).key)]
+
+    def seed(self, context):
+        return active_entry(context.scene.material_palette).seed + 1
+
+
+def _read_order(settings, regions, seed, is_whole):
+    """Read from the scene what the worker needs; raises PaletteError naming what can't be used."""
+    chosen = {
+        "engine": settings.engine,
+        "quality": settings.quality,
+        "resolution": settings.resolution,
+        "seed": seed,
+        "flatten": settings.flatten,
+        "metres_per_tile": settings.metres_per_tile,
+    }
+    read = photo_reader(settings.photo)
+    masks = _read_masks(settings, regions)
+    order = _Order(
+        read=read,
+        photo_name=os.path.basename(settings.photo.filepath_raw) or settings.photo.name,
+        masks=masks,
+        keys={region.name: region.key for region in regions},
+        chosen=chosen,
+        folder=None,
+        overwrite=False,
+        temporary=bpy.app.tempdir,
+    )
+    if not settings.pack:
+        order.folder, order.overwrite = _output_folder(settings), settings.overwrite and is_whole
+        if not is_whole:
+            # a palette in the folder holds the textures of the other materials
+            order.folder = _unused(order.folder)
+        elif order.folder.is_dir() and any(order.folder.iterdir()) and not order.overwrite:
+            raise PaletteError(f"Output folder isn't empty: {order.folder}. Choose another one, or turn on Overwrite")
+    return order
+
+
+def _read_masks(settings, regions):
+    """The regions' masks as {name: (H, W) bool}; raises PaletteError naming the region that can't be used."""
     from ..core.region import file_name
 
-    regions = [region for region in scene.regions if region.enabled]
     if not regions:
         raise PaletteError("No region to extract: add and paint one, import masks, or use Auto Segment")
-    size, owners, masks = tuple(scene.photo.size), {}, {}
+    size, owners, masks = tuple(settings.photo.size), {}, {}
     for region in regions:
         owner = owners.setdefault(file_name(region.name).casefold(), region)
         if owner != region:
@@ -128,21 +238,87 @@ def _read_masks(scene):
     return masks
 
 
-def _output_folder(scene):
-    if scene.output_folder.startswith("//") and not bpy.data.filepath:
+def _output_folder(settings):
+    if settings.output_folder.startswith("//") and not bpy.data.filepath:
         raise PaletteError("Output folder is relative to a file that isn't saved yet: save it, or pack the textures")
-    if not scene.output_folder.strip():
+    if not settings.output_folder.strip():
         raise PaletteError("No output folder: choose one, or pack the textures")
-    return Path(os.path.normpath(bpy.path.abspath(scene.output_folder)))
+    return Path(os.path.normpath(bpy.path.abspath(settings.output_folder)))
 
 
-def _read_inputs(read, masks, progress):
+def _unused(folder):
+    number, unused = 1, folder
+    while unused.exists():
+        number += 1
+        unused = folder.with_name(f"{folder.name}_{number}")
+    return unused
+
+
+def _work(order, progress, send):
+    """Everything that happens on the worker; touches no bpy."""
+    # importing torch takes seconds, which the window shouldn't wait for
+    progress(0.0, "Getting ready")
+    from ..core.output import staged
+    from ..core.palette import Settings
     from ..core.region import Region
 
+    settings = Settings(**order.chosen)
+    settings.check()
     progress(0.0, "Reading the photo")
-    pixels, warnings = read()
-    shape = pixels.shape[:2]
-    return pixels, [Region(name, _nearest(mask, shape)) for name, mask in masks.items()], warnings
+    pixels, order.warnings = order.read()
+    regions = [Region(name, _nearest(mask, pixels.shape[:2])) for name, mask in order.masks.items()]
+    place = staged(order.folder, order.overwrite) if order.folder else _temporary(order.temporary)
+    with place as staging:
+        made, cancelled = _extract(order, pixels, regions, settings, progress, send, staging)
+    return _Extracted(made, order.folder or staging, staging, order.folder is None, cancelled)
+
+
+@contextlib.contextmanager
+def _temporary(tempdir):
+    """A new folder that is removed when the body fails, else by whoever takes its content."""
+    staging = Path(tempfile.mkdtemp(prefix="material_palette_", dir=tempdir))
+    try:
+        yield staging
+    except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise
+
+
+def _extract(order, pixels, regions, settings, progress, send, staging):
+    """Return the list of _Made and whether the user cancelled before all were finished."""
+    from ..core.palette import Palette, extract_palette, write_material, write_palette
+    from ..core.region import file_name
+
+    made, materials = [], []
+
+    def on_material(material):
+        record = write_material(material, staging / file_name(material.name))
+        materials.append(material)
+        made.append(_Made(order.keys[material.name], record, staging, material.preview))
+        send(made[-1])
+
+    def extracting(fraction, message):
+        progress(_EXTRACTION * fraction, message)
+
+    cancelled = False
+    try:
+        palette = extract_palette(pixels, regions, settings, extracting, on_material, order.photo_name)
+    except Abandoned:
+        raise
+    except Cancelled:
+        if not any(material.error is None for material in materials):
+            raise
+        cancelled = True
+        palette = Palette(pixels, order.photo_name, regions[: len(materials)], settings, materials)
+    if order.folder:
+        palette.warnings[:0] = order.warnings
+
+        def writing(fraction, message):
+            if not cancelled:
+                progress(_EXTRACTION + (1.0 - _EXTRACTION) * fraction, message)
+
+        write_palette(palette, staging, writing, {one.record["name"]: one.record for one in made})
+    return made, cancelled
 
 
 def _nearest(mask, shape):
@@ -153,38 +329,12 @@ def _nearest(mask, shape):
     return mask[np.ix_(rows, columns)]
 
 
-def _extract(pixels, regions, settings, progress, photo_name, warnings, staging):
-    from ..core.palette import extract_palette, write_palette
-
-    def extracting(fraction, message):
-        progress(_EXTRACTION * fraction, message)
-
-    def writing(fraction, message):
-        progress(_EXTRACTION + (1.0 - _EXTRACTION) * fraction, message)
-
-    palette = extract_palette(pixels, regions, settings, extracting, photo_name=photo_name)
-    palette.warnings[:0] = warnings
-    written = write_palette(palette, staging, writing)
-    return written, {material.name: material.preview for material in palette.materials if material.preview is not None}
-
-
-def _replace_palette(settings, built):
-    """List the new materials; those of the last run that no object uses go when the file is closed, as any unused."""
-    for entry in settings.palette:
-        material = entry.material
-        if material is not None and material.users - material.use_fake_user <= 1 and material.asset_data:
-            material.asset_clear()
-    settings.palette.clear()
-    for record, material in built:
-        entry = settings.palette.add()
-        entry.name = record["name"]
-        entry.material = material
-        entry.warnings = "\n".join(record["warnings"])
-    settings.active_material = 0
+def _count(materials):
+    return f"{materials} material" if materials == 1 else f"{materials} materials"
 
 
 def _say(failed):
     return "; ".join(f"Region '{record['name']}' failed: {record['error']}" for record in failed)
 
 
-CLASSES = (MATERIAL_PALETTE_OT_extract,)
+CLASSES = (MATERIAL_PALETTE_OT_extract, MATERIAL_PALETTE_OT_vary)

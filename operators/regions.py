@@ -24,13 +24,27 @@ def add_region(settings, name, mask, automatic=False):
     if mask is None:
         width, height = settings.photo.size
         mask = np.zeros((height, width), bool)
+    keys = [0, *(known.key for known in (*settings.regions, *settings.palette))]
     region = settings.regions.add()
+    region.key = max(keys) + 1
     region.name = name
     region.mask = _mask_image(name, mask)
     region.colour = colorsys.hsv_to_rgb((len(settings.regions) - 1) * _GOLDEN_RATIO % 1.0, 0.75, 1.0)
     region.automatic = automatic
     settings.active_region = len(settings.regions) - 1
     return region
+
+
+def set_mask(region, mask):
+    """Give `region` the mask (H, W) bool, top row first; the image stays the same while its size does."""
+    image, (height, width) = region.mask, mask.shape
+    if image is None or tuple(image.size) != (width, height):
+        region.mask = _mask_image(region.name, mask)
+        if image is not None and image.users == 0:
+            bpy.data.images.remove(image)
+    else:
+        _write_mask(image, mask)
+    region.automatic = False
 
 
 def remove_region(settings, index):
@@ -83,12 +97,17 @@ def _mask_image(name, mask):
     height, width = mask.shape
     image = bpy.data.images.new(f"{name} mask", width, height, alpha=False)
     image.colorspace_settings.name = "Non-Color"
-    rgba = np.ones((height, width, 4), np.float32)
+    _write_mask(image, mask)
+    return image
+
+
+def _write_mask(image, mask):
+    rgba = np.ones((*mask.shape, 4), np.float32)
     rgba[..., :3] = mask[::-1, :, None]
     image.pixels.foreach_set(rgba.ravel())
+    image.update()
     # undo and saving keep packed pixels only
     image.pack()
-    return image
 
 
 def _unused_name(settings, name):
@@ -253,12 +272,12 @@ class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         # the folder is what the user edits elsewhere: importing it again brings the masks up to date
-        names = {region.name for region in regions}
-        for index in reversed(range(len(settings.regions))):
-            if settings.regions[index].name in names:
-                remove_region(settings, index)
+        known = {region.name: region for region in settings.regions}
         for region in regions:
-            add_region(settings, region.name, region.mask)
+            if region.name not in known:
+                add_region(settings, region.name, region.mask)
+            else:
+                set_mask(known[region.name], region.mask)
         self.report({"INFO"}, f"{len(regions)} regions imported")
         return {"FINISHED"}
 

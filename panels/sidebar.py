@@ -3,8 +3,11 @@
 import bpy
 from bpy.types import Panel, UIList
 
-from ..operators.background import time_left
+from ..operators import history
+from ..operators.background import duration, time_left
+from ..operators.palette import active_entry
 from ..operators.setup import missing
+from . import material
 
 _SPACES = ("IMAGE_EDITOR", "VIEW_3D")
 
@@ -19,7 +22,8 @@ class MATERIAL_PALETTE_UL_regions(UIList):
         row.separator(factor=0.5)
         name = row.row(align=True)
         name.active = item.enabled
-        name.prop(item, "name", text="", emboss=False, icon="NONE" if item.mask else "ERROR")
+        name.prop(item, "name", text="", emboss=False, icon="ERROR" if item.error or not item.mask else "NONE")
+        row.prop(item, "visible", text="", emboss=False, icon="HIDE_OFF" if item.visible else "HIDE_ON")
 
 
 class MATERIAL_PALETTE_UL_palette(UIList):
@@ -65,6 +69,8 @@ class RegionsPanel:
         column.operator("material_palette.remove_region", text="", icon="REMOVE")
         column.separator()
         column.operator("material_palette.paint_region", text="", icon="BRUSH_DATA")
+        if settings.active_region < len(settings.regions) and settings.regions[settings.active_region].error:
+            _draw_text(layout, context, settings.regions[settings.active_region].error, "ERROR")
         row = layout.row(align=True)
         row.operator("material_palette.import_masks", text="Import", icon="IMPORT")
         row.operator("material_palette.export_masks", text="Export", icon="EXPORT")
@@ -103,9 +109,13 @@ class ExtractPanel:
         if run.running:
             _draw_progress(layout, run)
         else:
-            row = layout.row()
+            enabled = sum(region.enabled for region in settings.regions)
+            row = layout.row(align=True)
             row.scale_y = 1.5
             row.operator("material_palette.extract", icon="MATERIAL")
+            row.operator("material_palette.extract", text="", icon="RESTRICT_SELECT_OFF").only_active = True
+            if enabled:
+                layout.label(text=_forecast(history.expected(settings, enabled), enabled), icon="TIME")
         if run.error:
             _draw_text(layout.box(), context, run.error, "ERROR")
 
@@ -120,19 +130,67 @@ class PalettePanel:
         if not settings.palette:
             layout.label(text="Materials appear here", icon="MATERIAL")
             return
-        layout.template_list(
-            "MATERIAL_PALETTE_UL_palette", "", settings, "palette", settings, "active_material", rows=3, maxrows=10
-        )
-        if settings.active_material >= len(settings.palette):
+        layout.row().prop(settings, "palette_view", expand=True)
+        if settings.palette_view == "GRID":
+            _draw_grid(layout, context, settings)
+        else:
+            layout.template_list(
+                "MATERIAL_PALETTE_UL_palette", "", settings, "palette", settings, "active_material", rows=3, maxrows=10
+            )
+        entry = active_entry(settings)
+        if entry is None:
             return
-        entry = settings.palette[settings.active_material]
         if entry.material is not None:
-            layout.template_icon(icon_value=layout.icon(entry.material), scale=7.0)
-        row = layout.row()
-        row.scale_y = 1.3
-        row.operator("material_palette.assign", icon="CHECKMARK")
+            row = layout.row(align=True)
+            row.prop(entry.material, "name", text="")
+            row.operator("material_palette.show_region", text="", icon="RESTRICT_SELECT_OFF")
+            row.operator("material_palette.delete_material", text="", icon="TRASH")
+            row = layout.row(align=True)
+            row.scale_y = 1.3
+            row.operator("material_palette.assign", icon="CHECKMARK")
+        else:
+            _draw_text(layout, context, f"The material of '{entry.name}' was deleted", "ERROR")
+            layout.operator("material_palette.delete_material", text="Remove from Palette", icon="TRASH")
+        row = layout.row(align=True)
+        row.operator("material_palette.vary", icon="FILE_REFRESH")
+        if entry.previous is not None:
+            row.operator("material_palette.compare", text="Compare", icon="UV_SYNC_SELECT")
+            row.operator("material_palette.discard_before", text="", icon="CHECKMARK")
         for warning in entry.warnings.splitlines():
             _draw_text(layout, context, warning, "INFO")
+
+
+class AdjustPanel:
+    bl_label = "Adjust"
+    bl_order = 4
+
+    @classmethod
+    def poll(cls, context):
+        entry = active_entry(context.scene.material_palette)
+        return entry is not None and entry.material is not None
+
+    def draw(self, context):
+        material.draw_controls(self.layout, active_entry(context.scene.material_palette).material)
+        self.layout.operator("material_palette.reset_material", icon="LOOP_BACK")
+
+
+def _draw_grid(layout, context, settings):
+    """Previews with a button each below, as many in a row as the sidebar has room for."""
+    width = context.region.width / context.preferences.system.ui_scale
+    columns = max(1, min(len(settings.palette), int(width // 95)))
+    grid = layout.grid_flow(row_major=True, columns=columns, even_columns=True, even_rows=True, align=True)
+    for index, entry in enumerate(settings.palette):
+        cell = grid.column(align=True)
+        cell.template_icon(icon_value=cell.icon(entry.material) if entry.material else 0, scale=4.5)
+        name = entry.material.name if entry.material else f"{entry.name} (deleted)"
+        icon = "INFO" if entry.warnings else "NONE"
+        chosen = index == settings.active_material
+        cell.operator("material_palette.select_material", text=name, depress=chosen, icon=icon).index = index
+
+
+def _forecast(seconds, regions):
+    what = "1 region" if regions == 1 else f"{regions} regions"
+    return f"{what}: about {duration(seconds)}" if seconds else f"{what}; the first run tells how long it takes"
 
 
 def _draw_progress(layout, run):
@@ -173,13 +231,16 @@ def _draw_text(layout, context, text, icon):
 def _panel(section, space):
     name = f"MATERIAL_PALETTE_PT_{section.bl_label.lower()}_{space.lower()}"
     place = {"bl_idname": name, "bl_space_type": space, "bl_region_type": "UI", "bl_category": "Palette"}
+    if section is AdjustPanel:
+        place["bl_parent_id"] = f"MATERIAL_PALETTE_PT_palette_{space.lower()}"
     return type(name, (section, Panel), place)
 
 
-_SECTIONS = (PhotoPanel, RegionsPanel, ExtractPanel, PalettePanel)
+_SECTIONS = (PhotoPanel, RegionsPanel, ExtractPanel, PalettePanel, AdjustPanel)
 CLASSES = (
     MATERIAL_PALETTE_UL_regions,
     MATERIAL_PALETTE_UL_palette,
+    *material.CLASSES,
     *(_panel(section, space) for space in _SPACES for section in _SECTIONS),
 )
 

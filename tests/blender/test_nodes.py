@@ -23,6 +23,10 @@ NODE_SIZES = {
     "ShaderNodeNormalMap": (150, 160),
     "ShaderNodeBsdfPrincipled": (240, 620),
     "ShaderNodeOutputMaterial": (140, 130),
+    "ShaderNodeHueSaturation": (150, 180),
+    "ShaderNodeMath": (140, 160),
+    "ShaderNodeVectorRotate": (140, 200),
+    "ShaderNodeDisplacement": (140, 180),
 }
 
 
@@ -91,6 +95,67 @@ def test_height_rides_along_without_a_node(tmp_path, make_record, write_maps):
     assert "height" not in {name for link in links_of(material) for name in link}
 
 
+@pytest.fixture
+def stone(tmp_path, make_record, write_maps):
+    return nodes.build_material(make_record(write_maps(), metres_per_tile=2.0), tmp_path, pack=True)
+
+
+def test_controls_at_their_defaults_need_no_node(stone):
+    controls = nodes.Controls(stone)
+    assert controls.values() == nodes.Controls.DEFAULTS | {"tile_size": 2.0}
+    before = links_of(stone), count_nodes(stone)
+    changed = {"rotation": 0.3, "relief": "BUMP", "strength": 0.5, "roughness_offset": -0.2, "hue": 0.6}
+    controls.set(changed | {"saturation": 0.5, "brightness": 1.5, "tile_size": 4.0})
+    assert controls.values() == pytest.approx(
+        changed | {"saturation": 0.5, "brightness": 1.5, "tile_size": 4.0, "relief": "BUMP"}
+    )
+    controls.reset()
+    assert (links_of(stone), count_nodes(stone)) == before
+    assert controls.values() == nodes.Controls.DEFAULTS | {"tile_size": 2.0}
+
+
+def test_controls_put_their_nodes_in_the_way_of_their_map(stone):
+    controls = nodes.Controls(stone)
+    before = links_of(stone)
+    controls.set({"brightness": 0.5, "roughness_offset": 0.1, "rotation": 1.0})
+    assert before - links_of(stone) == {
+        ("basecolor", "Color", "BsdfPrincipled", "Base Color"),
+        ("roughness", "Color", "BsdfPrincipled", "Roughness"),
+        ("normal", "Color", "NormalMap", "Color"),
+    }
+    assert links_of(stone) - before == {
+        ("basecolor", "Color", "HueSaturation", "Color"),
+        ("HueSaturation", "Color", "BsdfPrincipled", "Base Color"),
+        ("roughness", "Color", "Math", "Value"),
+        ("Math", "Value", "BsdfPrincipled", "Roughness"),
+        ("normal", "Color", "VectorRotate", "Vector"),
+        ("VectorRotate", "Vector", "NormalMap", "Color"),
+    }
+
+
+def test_relief_is_told_once_and_in_metres(stone):
+    controls = nodes.Controls(stone)
+    controls.strength = 0.5
+    for relief, method in (("BUMP", "BUMP"), ("DISPLACEMENT", "BOTH")):
+        controls.relief = relief
+        assert (controls.relief, stone.displacement_method) == (relief, method)
+        assert not node_of(stone, "ShaderNodeBsdfPrincipled").inputs["Normal"].is_linked
+        # half of 0.05 tile widths, two metres each
+        assert node_of(stone, "ShaderNodeDisplacement").inputs["Scale"].default_value == pytest.approx(0.05)
+    controls.tile_size = 1.0
+    assert node_of(stone, "ShaderNodeDisplacement").inputs["Scale"].default_value == pytest.approx(0.025)
+    assert ("height", "Color", "Displacement", "Height") in links_of(stone)
+
+
+def test_controls_of_what_is_not_there_do_nothing(tmp_path, make_record):
+    plain = nodes.build_material(make_record(), tmp_path, pack=True)
+    before = count_nodes(plain)
+    controls = nodes.Controls(plain)
+    controls.set(nodes.Controls.DEFAULTS | {"rotation": 1.0, "relief": "BUMP", "hue": 0.1, "tile_size": 3.0})
+    assert count_nodes(plain) == before and controls.tile_size is None
+    assert not nodes.Controls(bpy.data.materials.new("someone else's"))
+
+
 def test_constant_roughness_is_a_value_and_no_node(tmp_path, make_record, write_maps):
     record = make_record(write_maps(roles=("basecolor", "normal")) | {"roughness": {"value": 0.35}})
     material = nodes.build_material(record, tmp_path, pack=True)
@@ -116,8 +181,11 @@ def test_constants_alone_need_two_nodes_and_no_image(tmp_path, make_record):
     assert "height" not in material
 
 
-def test_no_two_nodes_overlap_and_links_run_to_the_right(tmp_path, make_record, write_maps):
+@pytest.mark.parametrize("adjusted", [False, True])
+def test_no_two_nodes_overlap_and_links_run_to_the_right(tmp_path, make_record, write_maps, adjusted):
     material = nodes.build_material(make_record(write_maps()), tmp_path, pack=True)
+    if adjusted:
+        nodes.Controls(material).set({"rotation": 1, "relief": "BUMP", "roughness_offset": 0.1, "hue": 0.1})
     boxes = []
     for node in material.node_tree.nodes:
         if node.bl_idname == "NodeFrame":

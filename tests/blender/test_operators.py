@@ -191,14 +191,89 @@ def test_extract_into_a_folder(ready, instant, tmp_path):
     assert bpy.ops.material_palette.extract() == {"FINISHED"}
 
 
-def test_extracting_again_keeps_used_materials_and_lets_unused_ones_go(ready, instant):
+def test_extracting_again_puts_the_new_material_where_the_old_one_was(ready, instant):
     bpy.ops.material_palette.extract()
     left, right = (entry.material for entry in ready.palette)
-    bpy.data.meshes.new("wall").materials.append(right)
+    wall = bpy.data.meshes.new("wall")
+    wall.materials.append(right)
+    right.material_palette.roughness_offset = 0.1
+    right.material_palette.rotation = 0.5
+    right.name = "my bricks"
     bpy.ops.material_palette.extract()
-    assert [entry.material.name for entry in ready.palette] == ["left.001", "right.001"]
-    assert left.users == 0 and left.asset_data is None  # gone when the file is saved
-    assert right.users > 0 and right.asset_data is not None
+    new = ready.palette[1].material
+    assert [entry.name for entry in ready.palette] == ["left", "right"]
+    assert new != right and wall.materials[0] == new
+    assert (new.name, right.name) == ("my bricks", "my bricks (before)")
+    assert new.material_palette.rotation == pytest.approx(0.5)
+    assert ready.palette[1].previous == right and right.asset_data is None and new.asset_data is not None
+    bpy.ops.material_palette.extract()
+    assert [m.name for m in bpy.data.materials if "before" in m.name] == ["left (before)", "my bricks (before)"]
+
+
+def test_only_the_active_region(ready, instant):
+    bpy.ops.material_palette.extract()
+    before = [entry.material for entry in ready.palette]
+    ready.active_region = 1
+    bpy.ops.material_palette.extract(only_active=True)
+    assert [entry.name for entry in ready.palette] == ["left", "right"]
+    assert ready.palette[0].material == before[0] and ready.palette[1].material != before[1]
+
+
+def test_a_variation_has_another_seed_and_can_be_compared(ready, instant, data_blocks):
+    ready.seed = 7
+    bpy.ops.material_palette.extract()
+    ready.active_material = 1
+    ready.regions[1].name = "renamed"  # what ties them is not the name
+    old = ready.palette[1].material
+    wall = bpy.data.meshes.new("wall")
+    wall.materials.append(old)
+    before = data_blocks()
+    assert not bpy.ops.material_palette.compare.poll()
+    bpy.ops.material_palette.vary()
+    new = ready.palette[1].material
+    assert [entry.seed for entry in ready.palette] == [7, 8]
+    assert wall.materials[0] == new != old
+    for expected in (old, new):
+        bpy.ops.material_palette.compare()
+        assert wall.materials[0] == ready.palette[1].material == expected
+        assert expected.name == "right" and expected.asset_data is not None
+    bpy.ops.material_palette.discard_before()
+    after = data_blocks()
+    assert after["materials"] == before["materials"] and len(after["images"]) == len(before["images"])
+    ready.regions.clear()
+    assert not bpy.ops.material_palette.vary.poll()
+
+
+def test_deleting_a_material_deletes_its_images(ready, instant, data_blocks):
+    before = data_blocks()
+    bpy.ops.material_palette.extract()
+    bpy.ops.material_palette.vary()
+    for _ in range(2):
+        bpy.ops.material_palette.delete_material()
+    assert data_blocks() == before
+    assert len(ready.palette) == 0
+    assert not bpy.ops.material_palette.delete_material.poll()
+
+
+def test_choosing_a_material_chooses_its_region(ready, instant):
+    bpy.ops.material_palette.extract()
+    bpy.ops.material_palette.select_material(index=1)
+    assert (ready.active_material, ready.active_region) == (1, 1)
+    bpy.ops.material_palette.select_material(index=0)
+    assert (ready.active_material, ready.active_region) == (0, 0)
+
+
+def test_a_variation_into_a_folder_leaves_the_other_textures(ready, instant, tmp_path):
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    bpy.ops.material_palette.extract()
+    files = sorted((tmp_path / "out").rglob("*"))
+    bpy.ops.material_palette.vary()
+    assert sorted((tmp_path / "out").rglob("*")) == files
+    assert (tmp_path / "out_2" / "left" / "left_basecolor.png").is_file()
+    for entry, folder in zip(ready.palette, ("out_2", "out"), strict=True):
+        image = next(n for n in entry.material.node_tree.nodes if n.bl_idname == "ShaderNodeTexImage").image
+        assert Path(image.filepath_raw) == tmp_path / folder / entry.name / f"{entry.name}_basecolor.png"
+        assert image.size[0] == 64
 
 
 def test_one_bad_region_is_reported_and_the_others_are_kept(ready, instant, capfd):
@@ -247,7 +322,7 @@ def test_a_failed_run_leaves_nothing(ready, monkeypatch, data_blocks, temporary_
     assert bpy.context.window_manager.material_palette_run.error == "the disk is full"
 
 
-def test_a_failing_build_leaves_nothing(ready, instant, monkeypatch, data_blocks, temporary_folders):
+def test_a_failing_build_is_named_and_leaves_the_others(ready, instant, monkeypatch, capfd, temporary_folders):
     from material_palette.core import nodes
 
     def mark_asset(material, description):
@@ -255,9 +330,11 @@ def test_a_failing_build_leaves_nothing(ready, instant, monkeypatch, data_blocks
             raise PaletteError("no asset")
 
     monkeypatch.setattr(nodes, "mark_asset", mark_asset)
-    before = data_blocks()
-    assert "no asset" in refused(bpy.ops.material_palette.extract)
-    assert data_blocks() == before
+    bpy.ops.material_palette.extract()
+    assert "Region 'right' failed: no asset" in capfd.readouterr().out
+    assert ready.regions[1].error == "no asset" and ready.regions[0].error == ""
+    assert [material.name for material in bpy.data.materials] == ["left"]
+    assert all(image.name.startswith("left") for image in bpy.data.images if "_" in image.name)
     assert temporary_folders() == []
 
 
@@ -290,6 +367,7 @@ class Modal:
     """Stands for the operator in a window, which background mode doesn't have."""
 
     bl_label = "Extract Palette"
+    only_active, is_whole = False, True
 
     def __init__(self):
         self.reports = []
@@ -300,7 +378,8 @@ class Modal:
     def start(self):
         from material_palette.operators.extract import MATERIAL_PALETTE_OT_extract as Extract
 
-        for name in ("prepare", "finish", "discard", "_start", "_drain", "_end", "_fail", "cancel"):
+        methods = "prepare regions seed receive finish discard cancel _take _start _drain _end _fail"
+        for name in methods.split():
             function = getattr(Extract, name)
             setattr(self, name, function if name == "discard" else function.__get__(self))
         assert self._start(bpy.context)
@@ -346,6 +425,107 @@ def test_cancel_into_a_folder_leaves_no_folder(ready, endless, tmp_path):
     while operator._drain(bpy.context) is None:
         time.sleep(0.01)
     assert sorted(tmp_path.rglob("*")) == files
+
+
+class Stepwise:
+    """A pipeline whose second region waits until it is told to go on or to stop."""
+
+    def __init__(self, extract_material):
+        self.extract_material, self.go = extract_material, threading.Event()
+
+    def __call__(self, pixels, region, settings, progress):
+        while region.name == "right" and not self.go.is_set():
+            progress(0.1, "waiting")
+            time.sleep(0.01)
+        return self.extract_material(pixels, region, settings, progress)
+
+
+@pytest.fixture
+def stepwise(ready, instant, monkeypatch):
+    """An extraction that has made its first material and waits with the second."""
+    from material_palette.core import palette
+
+    steps = Stepwise(palette.extract_material)
+    monkeypatch.setattr(palette, "extract_material", steps)
+
+    def start():
+        operator = Modal().start()
+        end = time.monotonic() + 20
+        while not ready.palette:
+            assert operator._drain(bpy.context) is None and time.monotonic() < end
+            time.sleep(0.01)
+        return operator
+
+    start.go = steps.go
+    return start
+
+
+def drain(operator):
+    while (result := operator._drain(bpy.context)) is None:
+        time.sleep(0.01)
+    return result
+
+
+def test_materials_appear_one_by_one(stepwise, ready):
+    operator = stepwise()
+    assert [entry.material.name for entry in ready.palette] == ["left"]
+    assert run_state().running
+    stepwise.go.set()
+    assert drain(operator) == {"FINISHED"}
+    assert [entry.material.name for entry in ready.palette] == ["left", "right"]
+
+
+def test_cancel_keeps_what_is_finished(stepwise, ready, temporary_folders):
+    operator = stepwise()
+    bpy.ops.material_palette.cancel()
+    assert drain(operator) == {"FINISHED"}  # so that undo takes it back
+    assert [entry.material.name for entry in ready.palette] == ["left"]
+    assert operator.reports == ["Cancelled: 1 material finished before"]
+    assert temporary_folders() == []
+
+
+def test_cancel_into_a_folder_writes_what_is_finished(stepwise, ready, tmp_path):
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    operator = stepwise()
+    assert not (tmp_path / "out").exists()
+    bpy.ops.material_palette.cancel()
+    drain(operator)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "left",
+        "masks",
+        "palette.json",
+        "palette.png",
+    ]
+    for image in (node.image for node in ready.palette[0].material.node_tree.nodes if hasattr(node, "image")):
+        assert Path(image.filepath_raw).is_file()
+
+
+def test_undo_during_a_run_loses_nothing_of_it(stepwise, ready):
+    bpy.context.preferences.edit.use_global_undo = True
+    bpy.ops.ed.undo_push(message="before")
+    bpy.data.meshes.new("cube")
+    bpy.ops.ed.undo_push(message="cube")
+    operator = stepwise()
+    bpy.ops.ed.undo()
+    assert len(bpy.data.materials) == 0
+    stepwise.go.set()
+    assert drain(operator) == {"FINISHED"}
+    palette = bpy.context.scene.material_palette.palette
+    assert sorted(entry.material.name for entry in palette) == ["left", "right"]
+    assert all(image.size[0] == 64 for entry in palette for image in images_in(entry.material))
+
+
+def images_in(material):
+    return [node.image for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeTexImage"]
+
+
+def test_loading_another_file_with_some_finished_leaves_nothing(stepwise, ready, tmp_path, temporary_folders):
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    stepwise()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert not (tmp_path / "out").exists()
+    assert len(bpy.data.materials) == 0
+    assert temporary_folders() == []
 
 
 def test_loading_another_file_stops_the_run(running, endless, tmp_path, temporary_folders):

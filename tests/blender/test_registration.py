@@ -55,30 +55,28 @@ def test_disabling_takes_the_command_back(monkeypatch):
     assert commands == {}
 
 
-def test_enabling_adds_operators_panels_and_settings(extension):
-    operators = {name for name in dir(bpy.ops.material_palette) if not name.startswith("_")}
-    assert operators == {
-        "add_region",
-        "assign",
-        "cancel",
-        "copy_install_command",
-        "export_masks",
-        "extract",
-        "import_masks",
-        "open_photo",
-        "paint_region",
-        "remove_region",
-        "segment",
-        "show_photo",
-    }
+def test_panels_are_in_both_editors(extension):
     panels = {name for name in dir(bpy.types) if name.startswith("MATERIAL_PALETTE_PT_")}
-    assert panels == {
-        f"MATERIAL_PALETTE_PT_{section}_{space}"
-        for section in ("photo", "regions", "extract", "palette")
-        for space in ("image_editor", "view_3d")
-    }
+    sections = ("photo", "regions", "extract", "palette", "adjust")
+    spaces = ("image_editor", "view_3d")
+    sidebar = {f"MATERIAL_PALETTE_PT_{section}_{space}" for section in sections for space in spaces}
+    assert panels == sidebar | {"MATERIAL_PALETTE_PT_material"}
     assert bpy.context.scene.material_palette.resolution == 1024
     assert not bpy.context.window_manager.material_palette_run.running
+
+
+def test_every_operator_and_setting_says_what_it_does(extension):
+    operators = [getattr(bpy.ops.material_palette, name) for name in dir(bpy.ops.material_palette)]
+    types = [operator.get_rna_type() for operator in operators]
+    assert len(types) > 15
+    groups = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MATERIAL_PALETTE_PG_")]
+    for rna in types:
+        assert len(rna.description.split()) > 3 and rna.name != rna.identifier, rna.identifier
+    for group in groups:
+        for prop in group.bl_rna.properties:
+            if prop.identifier not in {"rna_type", "name"} and not prop.is_hidden:
+                said = prop.description or prop.type in {"COLLECTION", "POINTER"}
+                assert said or prop.identifier in {"running", "progress", "message"}, (group, prop.identifier)
 
 
 def test_choices_are_those_of_the_pipeline(extension):

@@ -120,3 +120,26 @@ def test_green_of_a_normal_map_points_up(tmp_path, make_record, render):
     up, down = (middle(render(material, sun=(0, y, np.sqrt(0.75)), plane=True)).mean() for y in (0.5, -0.5))
     assert up / down == pytest.approx(2.0, rel=0.1)
     assert up == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("angle, sun", [(np.pi / 2, (1, 0)), (np.pi, (0, -1)), (-np.pi / 2, (-1, 0))])
+def test_a_turned_texture_turns_its_relief_along(tmp_path, make_record, render, angle, sun):
+    """The surface tilts to +Y of the texture. Turned on the mesh, it faces where +Y of the texture points there.
+
+    The mapping reads the texture at the turned coordinate, so that the picture itself turns the other way.
+    """
+    tilted = np.array([0.0, 0.5, np.sqrt(0.75)], np.float32)
+    (tmp_path / "stone").mkdir()
+    write_image(tmp_path / "stone/stone_normal.png", np.tile((tilted + 1) / 2, (8, 8, 1)))
+    maps = {
+        "basecolor": {"value": [0.5] * 3},
+        "normal": {"file": "stone/stone_normal.png"},
+        "roughness": {"value": 1.0},
+    }
+    material = nodes.build_material(make_record(maps), tmp_path, pack=True)
+    nodes.Controls(material).rotation = angle
+    x, y = sun
+    towards, away = (
+        middle(render(material, sun=(sign * x / 2, sign * y / 2, np.sqrt(0.75)), plane=True)).mean() for sign in (1, -1)
+    )
+    assert towards / away == pytest.approx(2.0, rel=0.1)

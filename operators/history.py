@@ -1,0 +1,45 @@
+"""How long extraction took on this machine: remembered in the extension's own folder, told before the next run."""
+
+from pathlib import Path
+
+import bpy
+
+from ..core import pace
+
+_history = None
+
+
+def add(chosen, records):
+    """Remember the seconds of the materials (records of palette.json) that were made with the settings `chosen`."""
+    history = _load()
+    for record in records:
+        if "sample" in record["seconds"]:  # a constant material says nothing of the engine
+            history.append(
+                {key: chosen[key] for key in ("engine", "quality", "resolution")}
+                | {"seconds": sum(record["seconds"].values())}
+            )
+    pace.remember(_path(), history)
+
+
+def expected(settings, regions):
+    """Seconds that extracting so many regions will take with a scene's settings; None while nothing is known."""
+    return pace.expected(_load(), settings.engine, settings.quality, settings.resolution, regions)
+
+
+def forget():
+    global _history
+    _history = None
+
+
+def _load():
+    global _history
+    if _history is None:
+        _history = pace.remembered(_path())
+    return _history
+
+
+def _path():
+    try:
+        return Path(bpy.utils.extension_path_user(__package__.rpartition(".")[0], create=True)) / "pace.json"
+    except ValueError:  # not installed as an extension: there is no folder to write to
+        return None
