@@ -162,6 +162,9 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
     )
     regions: CollectionProperty(type=MATERIAL_PALETTE_PG_region)
     active_region: IntProperty(name="Active Region", min=0, update=_show_active_mask, options={"SKIP_SAVE"})
+    show_regions: BoolProperty(
+        name="Show Regions", default=True, description="Show the regions over the photo in the Image Editor"
+    )
     auto_regions: IntProperty(
         name="Regions", default=6, min=1, max=64, soft_max=16, description="The most regions Auto Segment makes"
     )

@@ -2,25 +2,46 @@
 
 import bpy
 
-from . import assign, background, extract, history, palette, photo, regions, segment, setup
+from . import (
+    assign,
+    background,
+    draw_region,
+    edit_region,
+    examine,
+    extract,
+    history,
+    palette,
+    photo,
+    pick,
+    regions,
+    segment,
+    setup,
+)
 
-_MODULES = (setup, photo, regions, background, segment, extract, palette, assign)
+_MODULES = (setup, photo, regions, edit_region, draw_region, pick, background, segment, extract, palette, assign)
+_HANDLERS = (
+    ("load_pre", background.stop_before_load),
+    ("load_post", examine.all_changed),
+    ("undo_post", examine.all_changed),
+    ("redo_post", examine.all_changed),
+    ("save_pre", regions.pack_masks_before_save),
+)
 
 
 def register():
     for module in _MODULES:
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)
-    bpy.app.handlers.load_pre.append(background.stop_before_load)
-    bpy.app.handlers.save_pre.append(regions.pack_masks_before_save)
+    for name, function in _HANDLERS:
+        getattr(bpy.app.handlers, name).append(function)
 
 
 def unregister():
     background.stop()
-    background.forget()
-    history.forget()
-    bpy.app.handlers.save_pre.remove(regions.pack_masks_before_save)
-    bpy.app.handlers.load_pre.remove(background.stop_before_load)
+    for module in (background, history, examine, pick):
+        module.forget()
+    for name, function in _HANDLERS:
+        getattr(bpy.app.handlers, name).remove(function)
     for module in reversed(_MODULES):
         for cls in reversed(module.CLASSES):
             bpy.utils.unregister_class(cls)

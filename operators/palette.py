@@ -71,7 +71,7 @@ def _drop_before(entry):
         nodes.remove_material(old)
 
 
-class _NeedsMaterial:
+class NeedsMaterial:
     @classmethod
     def poll(cls, context):
         entry = active_entry(context.scene.material_palette)
@@ -81,7 +81,7 @@ class _NeedsMaterial:
         return True
 
 
-class _NeedsBefore(_NeedsMaterial):
+class _NeedsBefore(NeedsMaterial):
     @classmethod
     def poll(cls, context):
         if not super().poll(context):
@@ -148,7 +148,7 @@ class MATERIAL_PALETTE_OT_discard_before(_NeedsBefore, Operator):
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_reset_material(_NeedsMaterial, Operator):
+class MATERIAL_PALETTE_OT_reset_material(NeedsMaterial, Operator):
     """Take all adjustments back: the material is as it was extracted"""
 
     bl_idname = "material_palette.reset_material"
@@ -189,7 +189,7 @@ class MATERIAL_PALETTE_OT_delete_material(Operator):
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_show_region(_NeedsMaterial, Operator):
+class MATERIAL_PALETTE_OT_show_region(NeedsMaterial, Operator):
     """Show in the Image Editor the region of the photo that the active material came from"""
 
     bl_idname = "material_palette.show_region"

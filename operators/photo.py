@@ -159,4 +159,93 @@ class MATERIAL_PALETTE_OT_open_photo(Operator):
         return {"FINISHED"}
 
 
-CLASSES = (MATERIAL_PALETTE_OT_open_photo,)
+class MATERIAL_PALETTE_OT_use_shown_image(Operator):
+    """Extract materials from the image that the Image Editor shows"""
+
+    bl_idname = "material_palette.use_shown_image"
+    bl_label = "Use Shown Image"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        space = context.space_data
+        image = space.image if space is not None and space.type == "IMAGE_EDITOR" else None
+        settings = context.scene.material_palette
+        if image is None or image.type != "IMAGE" or any(region.mask == image for region in settings.regions):
+            cls.poll_message_set("No Image Editor that shows a picture")
+            return False
+        return True
+
+    def execute(self, context):
+        context.scene.material_palette.photo = context.space_data.image
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_OT_paste_photo(Operator):
+    """Take the picture in the clipboard as the photo"""
+
+    bl_idname = "material_palette.paste_photo"
+    bl_label = "Paste Photo"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        space = context.space_data
+        if space is None or space.type != "IMAGE_EDITOR" or not bpy.ops.image.clipboard_paste.poll():
+            cls.poll_message_set("Blender can paste pictures in the Image Editor only, and not on every system")
+            return False
+        return True
+
+    def execute(self, context):
+        before = set(bpy.data.images)
+        try:
+            bpy.ops.image.clipboard_paste()
+        except RuntimeError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        pasted = next((image for image in bpy.data.images if image not in before), None)
+        if pasted is None:
+            self.report({"ERROR"}, "There is no picture in the clipboard")
+            return {"CANCELLED"}
+        pasted.pack()
+        context.scene.material_palette.photo = pasted
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_FH_photo(bpy.types.FileHandler):
+    """A picture dropped on the Palette's editor becomes the photo."""
+
+    bl_idname = "MATERIAL_PALETTE_FH_photo"
+    bl_label = "Photo for Material Palette"
+    bl_import_operator = "material_palette.open_photo"
+    bl_file_extensions = ".jpg;.jpeg;.png;.tif;.tiff;.webp;.exr;.hdr;.bmp"
+
+    @classmethod
+    def poll_drop(cls, context):
+        return context.area is not None and context.area.type == "IMAGE_EDITOR" and not missing_sentence()
+
+
+class MATERIAL_PALETTE_OT_restore_defaults(Operator):
+    """Set quality, resolution, seed and the other settings of extraction back to their defaults"""
+
+    bl_idname = "material_palette.restore_defaults"
+    bl_label = "Restore Defaults"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        settings = context.scene.material_palette
+        for prop in settings.bl_rna.properties:
+            if prop.type not in {"POINTER", "COLLECTION"} and prop.identifier not in _KEPT:
+                settings.property_unset(prop.identifier)
+        return {"FINISHED"}
+
+
+_KEPT = {"name", "active_region", "active_material", "palette_view", "show_regions"}
+
+CLASSES = (
+    MATERIAL_PALETTE_OT_open_photo,
+    MATERIAL_PALETTE_OT_use_shown_image,
+    MATERIAL_PALETTE_OT_paste_photo,
+    MATERIAL_PALETTE_FH_photo,
+    MATERIAL_PALETTE_OT_restore_defaults,
+)

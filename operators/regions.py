@@ -102,12 +102,15 @@ def _mask_image(name, mask):
 
 
 def _write_mask(image, mask):
+    from . import examine
+
     rgba = np.ones((*mask.shape, 4), np.float32)
     rgba[..., :3] = mask[::-1, :, None]
     image.pixels.foreach_set(rgba.ravel())
     image.update()
     # undo and saving keep packed pixels only
     image.pack()
+    examine.changed(image)
 
 
 def _unused_name(settings, name):
@@ -119,7 +122,7 @@ def _unused_name(settings, name):
     return unused
 
 
-def _image_editor(context):
+def image_editor(context):
     """The Image Editor under the mouse, else the largest of the window, else None."""
     if context.area is not None and context.area.type == "IMAGE_EDITOR":
         return context.area
@@ -127,19 +130,52 @@ def _image_editor(context):
     return max(areas, key=lambda area: area.width * area.height, default=None)
 
 
-def _paint_white(context):
-    """White belongs to the region, black (Ctrl held) does not."""
+def show_photo(context, area):
+    """Let the Image Editor `area` show the photo, out of paint mode."""
+    space = area.spaces.active
+    if space.mode != "VIEW":
+        space.mode = "VIEW"
+    if space.image != context.scene.material_palette.photo:
+        space.image = context.scene.material_palette.photo
+    area.tag_redraw()
+
+
+def painted_region(settings, space):
+    """The region whose mask an Image Editor's space shows, or None."""
+    image = space.image if space is not None and space.type == "IMAGE_EDITOR" else None
+    return next((region for region in settings.regions if image is not None and region.mask == image), None)
+
+
+def _soft_brush(context):
+    """A soft round brush, where this Blender has one to be chosen."""
+    paint = context.scene.tool_settings.image_paint
+    try:  # brushes are assets from 4.3 on
+        bpy.ops.brush.asset_activate(
+            asset_library_type="ESSENTIALS",
+            relative_asset_identifier="brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Soft",
+        )
+    except (AttributeError, RuntimeError):
+        pass
+    if paint.brush is None:
+        try:
+            paint.brush = bpy.data.brushes.get("TexDraw") or bpy.data.brushes.new("TexDraw", mode="TEXTURE_PAINT")
+        except (AttributeError, RuntimeError):  # read-only where brushes are assets
+            pass
+
+
+def _paint_colours(context, erase):
+    """White belongs to the region, black does not; Ctrl paints the other one."""
     paint = context.scene.tool_settings.image_paint
     # moved into each paint mode with Blender 5.0
     unified = getattr(paint, "unified_paint_settings", None) or context.scene.tool_settings.unified_paint_settings
     for owner in (unified, paint.brush):
         # an essential brush of a library refuses changes; the unified colour is what counts then
         if owner is not None and getattr(owner, "is_editable", True):
-            owner.color = (1.0, 1.0, 1.0)
-            owner.secondary_color = (0.0, 0.0, 0.0)
+            owner.color = (0.0,) * 3 if erase else (1.0,) * 3
+            owner.secondary_color = (1.0,) * 3 if erase else (0.0,) * 3
 
 
-class _NeedsPhoto:
+class NeedsPhoto:
     @classmethod
     def poll(cls, context):
         if context.scene.material_palette.photo is not None:
@@ -148,7 +184,7 @@ class _NeedsPhoto:
         return False
 
 
-class _NeedsRegion:
+class NeedsRegion:
     @classmethod
     def poll(cls, context):
         settings = context.scene.material_palette
@@ -158,7 +194,7 @@ class _NeedsRegion:
         return False
 
 
-class MATERIAL_PALETTE_OT_add_region(_NeedsPhoto, Operator):
+class MATERIAL_PALETTE_OT_add_region(NeedsPhoto, Operator):
     """Add an empty region, to be painted over the photo"""
 
     bl_idname = "material_palette.add_region"
@@ -176,7 +212,7 @@ class MATERIAL_PALETTE_OT_add_region(_NeedsPhoto, Operator):
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_remove_region(_NeedsRegion, Operator):
+class MATERIAL_PALETTE_OT_remove_region(NeedsRegion, Operator):
     """Remove the active region and its mask"""
 
     bl_idname = "material_palette.remove_region"
@@ -189,12 +225,35 @@ class MATERIAL_PALETTE_OT_remove_region(_NeedsRegion, Operator):
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_paint_region(_NeedsRegion, Operator):
-    """Paint the active region in the Image Editor: white adds, black (Ctrl) takes away"""
+class MATERIAL_PALETTE_OT_remove_all_regions(NeedsRegion, Operator):
+    """Remove all regions and their masks"""
+
+    bl_idname = "material_palette.remove_all_regions"
+    bl_label = "Remove All Regions"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def invoke(self, context, event):
+        return context.window_manager.invoke_confirm(self, event)
+
+    def execute(self, context):
+        settings = context.scene.material_palette
+        while settings.regions:
+            remove_region(settings, 0)
+        return {"FINISHED"}
+
+
+class MATERIAL_PALETTE_OT_paint_region(NeedsRegion, Operator):
+    """Paint the active region over the photo in the Image Editor. Ctrl does the opposite"""
 
     bl_idname = "material_palette.paint_region"
     bl_label = "Paint Region"
     bl_options = {"REGISTER", "UNDO"}
+
+    erase: BoolProperty(name="Erase", description="Take away instead of adding", options={"SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, context, properties):
+        return "Take away from the active region with the brush. Ctrl adds" if properties.erase else cls.__doc__
 
     def execute(self, context):
         settings = context.scene.material_palette
@@ -202,20 +261,22 @@ class MATERIAL_PALETTE_OT_paint_region(_NeedsRegion, Operator):
         if region.mask is None:
             self.report({"ERROR"}, f"Region '{region.name}' has no mask image")
             return {"CANCELLED"}
-        area = _image_editor(context)
+        area = image_editor(context)
         if area is None:
             self.report({"ERROR"}, "No Image Editor in this window to paint in: open one beside this editor")
             return {"CANCELLED"}
         space = area.spaces.active
         space.image = region.mask
         space.mode = "PAINT"
-        _paint_white(context)
+        with context.temp_override(area=area, region=next(r for r in area.regions if r.type == "WINDOW")):
+            _soft_brush(context)
+        _paint_colours(context, self.erase)
         region.automatic = False
         area.tag_redraw()
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_show_photo(_NeedsPhoto, Operator):
+class MATERIAL_PALETTE_OT_show_photo(NeedsPhoto, Operator):
     """Show the photo in the Image Editor again"""
 
     bl_idname = "material_palette.show_photo"
@@ -223,12 +284,11 @@ class MATERIAL_PALETTE_OT_show_photo(_NeedsPhoto, Operator):
     bl_options = {"REGISTER"}
 
     def execute(self, context):
-        area = _image_editor(context)
+        area = image_editor(context)
         if area is None:
             self.report({"ERROR"}, "No Image Editor in this window")
             return {"CANCELLED"}
-        area.spaces.active.mode = "VIEW"
-        area.spaces.active.image = context.scene.material_palette.photo
+        show_photo(context, area)
         return {"FINISHED"}
 
 
@@ -272,12 +332,13 @@ class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         # the folder is what the user edits elsewhere: importing it again brings the masks up to date
-        known = {region.name: region for region in settings.regions}
+        known, active = {region.name: region for region in settings.regions}, settings.active_region
         for region in regions:
             if region.name not in known:
                 add_region(settings, region.name, region.mask)
             else:
                 set_mask(known[region.name], region.mask)
+        settings.active_region = active
         self.report({"INFO"}, f"{len(regions)} regions imported")
         return {"FINISHED"}
 
@@ -322,6 +383,7 @@ class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, Operator):
 CLASSES = (
     MATERIAL_PALETTE_OT_add_region,
     MATERIAL_PALETTE_OT_remove_region,
+    MATERIAL_PALETTE_OT_remove_all_regions,
     MATERIAL_PALETTE_OT_paint_region,
     MATERIAL_PALETTE_OT_show_photo,
     MATERIAL_PALETTE_OT_import_masks,

@@ -35,8 +35,10 @@ class MATERIAL_PALETTE_OT_segment(BackgroundOperator, Operator):
         for index in reversed(range(len(settings.regions))):
             if settings.regions[index].automatic:
                 remove_region(settings, index)
+        first = len(settings.regions)
         for region in result:
             add_region(settings, region.name, region.mask, automatic=True)
+        settings.active_region = first
         self.report({"INFO"}, f"{len(result)} regions found")
 
 

@@ -1,13 +1,15 @@
-"""The sidebar tab "Palette" of the Image Editor and the 3D View, and the regions drawn over the photo."""
+"""The sidebar tab "Palette" of the Image Editor and the 3D View, menus, and the regions drawn over the photo."""
 
-from . import overlay, sidebar
+from . import menus, overlay, sidebar
+
+_MODULES = (sidebar, menus, overlay)
 
 
 def register():
-    sidebar.register()
-    overlay.register()
+    for module in _MODULES:
+        module.register()
 
 
 def unregister():
-    overlay.unregister()
-    sidebar.unregister()
+    for module in reversed(_MODULES):
+        module.unregister()

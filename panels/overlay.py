@@ -1,6 +1,8 @@
-"""While an Image Editor shows a region's mask, show the photo there: tinted within the region, dim outside."""
+"""The regions over the photo in the Image Editor: tinted, outlined at any zoom, and while one is painted, the photo."""
 
 import bpy
+
+from ..operators import examine
 
 _VERTEX = """
 void main() {
@@ -10,17 +12,32 @@ void main() {
 """
 
 # The frame buffer is sRGB and encodes what is written: photo (linear after sampling) and tint are mixed as linear.
-_FRAGMENT = """
+_PHOTO = """
 void main() {
-  vec3 shown = texture(photo, uv).rgb;
   float inside = step(0.001, texture(mask, uv).r);
-  shown = mix(shown * 0.25, mix(shown, pow(tint, vec3(2.2)), 0.35), inside);
-  colour = vec4(shown, 1.0);
+  colour = vec4(texture(photo, uv).rgb * mix(0.3, 1.0, inside), 1.0);
+}
+"""
+
+# Inside a tint; where the mask changes within `width` pixels of the screen, a line.
+_REGION = """
+void main() {
+  vec2 pixel = 1.0 / (high - low);
+  float inside = step(0.001, texture(mask, uv).r);
+  float least = inside, most = inside;
+  for (int i = 0; i < 8; i++) {
+    float angle = 0.7854 * float(i);
+    float there = step(0.001, texture(mask, uv + width * pixel * vec2(cos(angle), sin(angle))).r);
+    least = min(least, there);
+    most = max(most, there);
+  }
+  float line = most - least;
+  colour = vec4(pow(tint, vec3(2.2)), max(line, inside * fill));
 }
 """
 
 _handle = None
-_shader = None
+_shaders = {}
 
 
 def register():
@@ -30,56 +47,80 @@ def register():
 
 
 def unregister():
-    global _handle, _shader
+    global _handle
     if _handle is not None:
         bpy.types.SpaceImageEditor.draw_handler_remove(_handle, "WINDOW")
-    _handle = _shader = None
+    _handle = None
+    _shaders.clear()
 
 
 def _draw():
+    import gpu
+
     context = bpy.context
     settings = context.scene.material_palette
     image = context.space_data.image
     if image is None or settings.photo is None:
         return
-    region = next((region for region in settings.regions if region.mask == image), None)
-    if region is not None:
-        _draw_region(context.region.view2d, settings.photo, image, region.colour)
+    view = context.region.view2d
+    painted = next((region for region in settings.regions if region.mask == image), None)
+    if painted is not None:
+        examine.changed(image)
+        _draw_square("photo", _PHOTO, view, photo=settings.photo, mask=image)
+    elif image != settings.photo or not settings.show_regions:
+        return
+    active = settings.regions[settings.active_region] if settings.active_region < len(settings.regions) else None
+    others = (
+        [region for region in settings.regions if region.visible and region != active] if settings.show_regions else []
+    )
+    gpu.state.blend_set("ALPHA")
+    for region in [*others, *([active] if active and (active.visible or painted) else [])]:
+        if region.mask is not None and all(region.mask.size):
+            width, fill = (2.0, 0.3) if region == active else (1.0, 0.15)
+            values = {"tint": region.colour, "width": width, "fill": 0.15 if painted == region else fill}
+            _draw_square("region", _REGION, view, mask=region.mask, **values)
+    gpu.state.blend_set("NONE")
 
 
-def _draw_region(view, photo, mask, colour):
+def _draw_square(name, fragment, view, **values):
+    """Draw the image's place in the editor with a shader; images become samplers, other values push constants."""
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    global _shader
-    if _shader is None:
-        _shader = _make_shader(gpu)
-    square = ((0, 0), (1, 0), (1, 1), (0, 1))
-    batch = batch_for_shader(_shader, "TRI_FAN", {"corner": square})
-    _shader.bind()
-    _shader.uniform_float("low", view.view_to_region(0.0, 0.0, clip=False))
-    _shader.uniform_float("high", view.view_to_region(1.0, 1.0, clip=False))
-    _shader.uniform_float("tint", colour)
+    images = [key for key, value in values.items() if isinstance(value, bpy.types.Image)]
+    if name not in _shaders:
+        _shaders[name] = _make_shader(gpu, fragment, images)
+    shader = _shaders[name]
+    batch = batch_for_shader(shader, "TRI_FAN", {"corner": ((0, 0), (1, 0), (1, 1), (0, 1))})
+    shader.bind()
+    shader.uniform_float("low", view.view_to_region(0.0, 0.0, clip=False))
+    shader.uniform_float("high", view.view_to_region(1.0, 1.0, clip=False))
     matrix = gpu.matrix.get_projection_matrix() @ gpu.matrix.get_model_view_matrix()
-    _shader.uniform_float("ModelViewProjectionMatrix", matrix)
-    _shader.uniform_sampler("photo", gpu.texture.from_image(photo))
-    _shader.uniform_sampler("mask", gpu.texture.from_image(mask))
-    batch.draw(_shader)
+    shader.uniform_float("ModelViewProjectionMatrix", matrix)
+    for key, value in values.items():
+        if key in images:
+            shader.uniform_sampler(key, gpu.texture.from_image(value))
+        else:
+            shader.uniform_float(key, value)
+    batch.draw(shader)
 
 
-def _make_shader(gpu):
+def _make_shader(gpu, fragment, images):
     link = gpu.types.GPUStageInterfaceInfo("material_palette_link")
     link.smooth("VEC2", "uv")
     info = gpu.types.GPUShaderCreateInfo()
     info.push_constant("MAT4", "ModelViewProjectionMatrix")
     info.push_constant("VEC2", "low")
     info.push_constant("VEC2", "high")
-    info.push_constant("VEC3", "tint")
-    info.sampler(0, "FLOAT_2D", "photo")
-    info.sampler(1, "FLOAT_2D", "mask")
+    if "tint" in fragment:
+        info.push_constant("VEC3", "tint")
+        info.push_constant("FLOAT", "width")
+        info.push_constant("FLOAT", "fill")
+    for slot, name in enumerate(images):
+        info.sampler(slot, "FLOAT_2D", name)
     info.vertex_in(0, "VEC2", "corner")
     info.vertex_out(link)
     info.fragment_out(0, "VEC4", "colour")
     info.vertex_source(_VERTEX)
-    info.fragment_source(_FRAGMENT)
+    info.fragment_source(fragment)
     return gpu.shader.create_from_info(info)

@@ -3,9 +3,10 @@
 import bpy
 from bpy.types import Panel, UIList
 
-from ..operators import history
+from ..operators import examine, history
 from ..operators.background import duration, time_left
 from ..operators.palette import active_entry
+from ..operators.regions import painted_region
 from ..operators.setup import missing
 from . import material
 
@@ -14,15 +15,23 @@ _SPACES = ("IMAGE_EDITOR", "VIEW_3D")
 
 class MATERIAL_PALETTE_UL_regions(UIList):
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
+        seen = examine.known(item)
         row = layout.row(align=True)
         row.prop(item, "enabled", text="")
         swatch = row.row(align=True)
-        swatch.ui_units_x = 1.0
+        swatch.ui_units_x = 0.8
         swatch.prop(item, "colour", text="")
         row.separator(factor=0.5)
         name = row.row(align=True)
         name.active = item.enabled
-        name.prop(item, "name", text="", emboss=False, icon="ERROR" if item.error or not item.mask else "NONE")
+        name.prop(item, "name", text="", emboss=False, icon_value=seen.icon if seen else 0)
+        if item.error or (seen and seen.warning):
+            row.label(text="", icon="ERROR")
+        if seen and seen.area:
+            area = row.row(align=True)
+            area.alignment = "RIGHT"
+            area.active = False
+            area.label(text=f"{seen.area:.0%}" if seen.area >= 0.01 else "<1%")
         row.prop(item, "visible", text="", emboss=False, icon="HIDE_OFF" if item.visible else "HIDE_ON")
 
 
@@ -47,38 +56,65 @@ class PhotoPanel:
         row = layout.row(align=True)
         row.prop(settings, "photo", text="")
         row.operator("material_palette.open_photo", text="", icon="FILE_FOLDER")
-        if settings.photo is None:
-            layout.operator("material_palette.open_photo", icon="IMAGE_DATA")
-        else:
+        if settings.photo is not None:
             row.operator("material_palette.show_photo", text="", icon="HIDE_OFF")
+        else:
+            layout.operator("material_palette.open_photo", icon="IMAGE_DATA")
+        shown = context.space_data.image if context.space_data.type == "IMAGE_EDITOR" else None
+        if bpy.ops.material_palette.use_shown_image.poll() and shown != settings.photo:
+            layout.operator("material_palette.use_shown_image", icon="IMAGE_REFERENCE")
+        if settings.photo is None and bpy.ops.material_palette.paste_photo.poll():
+            layout.operator("material_palette.paste_photo", icon="PASTEDOWN")
 
 
 class RegionsPanel:
     bl_label = "Regions"
     bl_order = 1
 
+    def draw_header_preset(self, context):
+        settings = context.scene.material_palette
+        self.layout.prop(settings, "show_regions", text="", icon="OVERLAY", emboss=False)
+
     def draw(self, context):
         layout = self.layout
         settings = context.scene.material_palette
         row = layout.row()
         row.template_list(
-            "MATERIAL_PALETTE_UL_regions", "", settings, "regions", settings, "active_region", rows=4, maxrows=8
+            "MATERIAL_PALETTE_UL_regions", "", settings, "regions", settings, "active_region", rows=5, maxrows=8
         )
         column = row.column(align=True)
         column.operator("material_palette.add_region", text="", icon="ADD")
         column.operator("material_palette.remove_region", text="", icon="REMOVE")
         column.separator()
-        column.operator("material_palette.paint_region", text="", icon="BRUSH_DATA")
-        if settings.active_region < len(settings.regions) and settings.regions[settings.active_region].error:
-            _draw_text(layout, context, settings.regions[settings.active_region].error, "ERROR")
+        column.menu("MATERIAL_PALETTE_MT_region", text="", icon="DOWNARROW_HLT")
+        region = settings.regions[settings.active_region] if settings.active_region < len(settings.regions) else None
+        if region is not None:
+            seen = examine.known(region)
+            for problem in filter(None, (region.error, seen.warning if seen else "")):
+                _draw_text(layout, context, problem, "ERROR")
+        if painted_region(settings, context.space_data):
+            _draw_painting(layout, settings)
+            return
         row = layout.row(align=True)
-        row.operator("material_palette.import_masks", text="Import", icon="IMPORT")
-        row.operator("material_palette.export_masks", text="Export", icon="EXPORT")
+        row.operator("material_palette.pick_region", text="Pick Material", icon="EYEDROPPER")
+        row.operator("material_palette.paint_region", text="Paint", icon="BRUSH_DATA")
+        row = layout.row(align=True)
+        for shape in ("LASSO", "POLYGON", "BOX"):
+            row.operator("material_palette.draw_region", text=shape.title()).shape = shape
         row = layout.row(align=True)
         row.operator("material_palette.segment", icon="MOD_EXPLODE")
         count = row.row(align=True)
         count.ui_units_x = 4.0
         count.prop(settings, "auto_regions", text="")
+
+
+def _draw_painting(layout, settings):
+    box = layout.box()
+    row = box.row(align=True)
+    row.operator("material_palette.paint_region", text="Add", icon="ADD")
+    row.operator("material_palette.paint_region", text="Erase", icon="REMOVE").erase = True
+    box.operator("material_palette.show_photo", text="Done", icon="CHECKMARK")
+    box.label(text="Ctrl does the opposite", icon="INFO")
 
 
 class ExtractPanel:
@@ -100,12 +136,6 @@ class ExtractPanel:
         column.prop(settings, "quality")
         column.prop(settings, "resolution")
         column.prop(settings, "metres_per_tile")
-        column.prop(settings, "seed")
-        column.prop(settings, "flatten")
-        column.prop(settings, "pack")
-        if not settings.pack:
-            column.prop(settings, "output_folder", text="Folder")
-            column.prop(settings, "overwrite")
         if run.running:
             _draw_progress(layout, run)
         else:
@@ -118,6 +148,31 @@ class ExtractPanel:
                 layout.label(text=_forecast(history.expected(settings, enabled), enabled), icon="TIME")
         if run.error:
             _draw_text(layout.box(), context, run.error, "ERROR")
+
+
+class OptionsPanel:
+    bl_label = "Options"
+    bl_parent = "extract"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        return not missing()
+
+    def draw(self, context):
+        layout = self.layout
+        settings = context.scene.material_palette
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.active = not context.window_manager.material_palette_run.running
+        column = layout.column()
+        column.prop(settings, "seed")
+        column.prop(settings, "flatten")
+        column.prop(settings, "pack")
+        if not settings.pack:
+            column.prop(settings, "output_folder", text="Folder")
+            column.prop(settings, "overwrite")
+        layout.operator("material_palette.restore_defaults", icon="LOOP_BACK")
 
 
 class PalettePanel:
@@ -148,6 +203,8 @@ class PalettePanel:
             row = layout.row(align=True)
             row.scale_y = 1.3
             row.operator("material_palette.assign", icon="CHECKMARK")
+            row.operator("material_palette.assign", text="Assign and Map", icon="UV").mapping = "UNMAPPED"
+            row.operator("material_palette.replace_material", text="", icon="ARROW_LEFTRIGHT")
         else:
             _draw_text(layout, context, f"The material of '{entry.name}' was deleted", "ERROR")
             layout.operator("material_palette.delete_material", text="Remove from Palette", icon="TRASH")
@@ -162,7 +219,7 @@ class PalettePanel:
 
 class AdjustPanel:
     bl_label = "Adjust"
-    bl_order = 4
+    bl_parent = "palette"
 
     @classmethod
     def poll(cls, context):
@@ -186,6 +243,8 @@ def _draw_grid(layout, context, settings):
         icon = "INFO" if entry.warnings else "NONE"
         chosen = index == settings.active_material
         cell.operator("material_palette.select_material", text=name, depress=chosen, icon=icon).index = index
+    for _ in range(-len(settings.palette) % columns):  # a row that isn't full would have wide cells
+        grid.column()
 
 
 def _forecast(seconds, regions):
@@ -231,12 +290,12 @@ def _draw_text(layout, context, text, icon):
 def _panel(section, space):
     name = f"MATERIAL_PALETTE_PT_{section.bl_label.lower()}_{space.lower()}"
     place = {"bl_idname": name, "bl_space_type": space, "bl_region_type": "UI", "bl_category": "Palette"}
-    if section is AdjustPanel:
-        place["bl_parent_id"] = f"MATERIAL_PALETTE_PT_palette_{space.lower()}"
+    if hasattr(section, "bl_parent"):
+        place["bl_parent_id"] = f"MATERIAL_PALETTE_PT_{section.bl_parent}_{space.lower()}"
     return type(name, (section, Panel), place)
 
 
-_SECTIONS = (PhotoPanel, RegionsPanel, ExtractPanel, PalettePanel, AdjustPanel)
+_SECTIONS = (PhotoPanel, RegionsPanel, ExtractPanel, OptionsPanel, PalettePanel, AdjustPanel)
 CLASSES = (
     MATERIAL_PALETTE_UL_regions,
     MATERIAL_PALETTE_UL_palette,

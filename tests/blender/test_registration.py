@@ -21,8 +21,10 @@ def registered():
     }
     for name in HANDLERS:
         found[name] = list(getattr(bpy.app.handlers, name))
-    for menu in (bpy.types.TOPBAR_MT_editor_menus, bpy.types.STATUSBAR_HT_header, bpy.types.NODE_MT_context_menu):
-        found[menu.__name__] = list(getattr(menu.draw, "_draw_funcs", ()))
+    for name in ("TOPBAR_MT_editor_menus", "STATUSBAR_HT_header", "IMAGE_MT_image", "VIEW3D_MT_object"):
+        draw = getattr(bpy.types, name).draw
+        ours = (function.__module__ for function in getattr(draw, "_draw_funcs", ()))
+        found[name] = [module for module in ours if not module.startswith("bl_ui")]
     return found
 
 
@@ -57,7 +59,7 @@ def test_disabling_takes_the_command_back(monkeypatch):
 
 def test_panels_are_in_both_editors(extension):
     panels = {name for name in dir(bpy.types) if name.startswith("MATERIAL_PALETTE_PT_")}
-    sections = ("photo", "regions", "extract", "palette", "adjust")
+    sections = ("photo", "regions", "extract", "options", "palette", "adjust")
     spaces = ("image_editor", "view_3d")
     sidebar = {f"MATERIAL_PALETTE_PT_{section}_{space}" for section in sections for space in spaces}
     assert panels == sidebar | {"MATERIAL_PALETTE_PT_material"}

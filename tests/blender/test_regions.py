@@ -1,0 +1,177 @@
+"""Edits of regions as the operators do them, and what the list says of a region."""
+
+import bpy
+import pytest
+from material_palette.core.errors import PaletteError
+
+
+@pytest.fixture
+def regions(settings, photo_and_masks):
+    photo, masks = photo_and_masks
+    bpy.ops.material_palette.open_photo(filepath=str(photo))
+    bpy.ops.material_palette.import_masks(directory=str(masks))
+    return settings.regions
+
+
+def mask_of(region):
+    from material_palette.operators.regions import read_mask_image
+
+    return read_mask_image(region)
+
+
+def test_grow_and_shrink_from_the_menu(regions):
+    before = mask_of(regions[0])
+    bpy.ops.material_palette.grow_region(distance=4)
+    grown = mask_of(regions[0])
+    assert grown.sum() > before.sum() and (grown >= before).all()
+    bpy.ops.material_palette.grow_region(distance=-6)
+    assert (mask_of(regions[0]) < grown).any() and not (mask_of(regions[0]) > grown).any()
+    with pytest.raises(RuntimeError, match="Nothing of 'left'"):
+        bpy.ops.material_palette.grow_region(distance=-500)
+    assert mask_of(regions[0]).any()
+
+
+def test_merge_and_split_undo_each_other(settings, regions):
+    left, right = mask_of(regions[0]), mask_of(regions[1])
+    key = regions[0].key
+    images = len(bpy.data.images)
+    bpy.ops.material_palette.merge_region(other=str(regions[1].key))
+    assert [region.key for region in regions] == [key] and (mask_of(regions[0]) == left | right).all()
+    assert len(bpy.data.images) == images - 1
+    bpy.ops.material_palette.split_region()
+    assert [region.name for region in regions] == ["left", "left 2"] and regions[0].key == key
+    assert {mask_of(region).sum() for region in regions} == {left.sum(), right.sum()}
+
+
+def test_outline_adds_takes_away_and_begins(settings, regions):
+    from material_palette.operators.draw_region import apply_outline
+
+    before = mask_of(regions[0])
+    box = [(0, 80), (60, 80), (60, 96), (0, 96)]
+    apply_outline(settings, box)
+    assert mask_of(regions[0])[85:95, 5:55].all() and mask_of(regions[0]).sum() > before.sum()
+    apply_outline(settings, box, take_away=True)
+    assert not mask_of(regions[0])[81:, :59].any()
+    bpy.ops.material_palette.remove_all_regions()
+    apply_outline(settings, box)
+    assert len(regions) == 1 and mask_of(regions[0]).sum() == pytest.approx(60 * 16, rel=0.1)
+
+
+def test_an_edited_region_is_no_longer_automatic(settings, regions):
+    regions[0].automatic = True
+    bpy.ops.material_palette.smooth_region(radius=2)
+    assert not regions[0].automatic
+
+
+def test_the_list_says_what_is_wrong(settings, regions):
+    from material_palette.operators.draw_region import apply_outline
+    from material_palette.operators.examine import examine
+
+    examined, thumbnail = examine(settings, regions[0])
+    assert examined.warning == "" and examined.area == pytest.approx(mask_of(regions[0]).mean())
+    inside = thumbnail[..., 3] > 0
+    assert inside.any() and thumbnail[inside][:, :3].std() > 0.05
+    bpy.ops.material_palette.add_region(name="sky")
+    assert "empty" in examine(settings, regions[2])[0].warning
+    apply_outline(settings, [(0, 0), (5, 0), (5, 5), (0, 5)])
+    assert "too small" in examine(settings, regions[2])[0].warning
+    settings.photo = bpy.data.images.new("grey", 160, 96)
+    assert "constant" in examine(settings, regions[0])[0].warning
+    settings.photo = bpy.data.images.new("larger", 200, 96)
+    assert "size" in examine(settings, regions[0])[0].warning
+
+
+def test_a_mask_of_another_size_is_not_drawn_on(settings, regions):
+    from material_palette.operators.draw_region import apply_outline
+
+    settings.photo = bpy.data.images.new("larger", 200, 96)
+    with pytest.raises(PaletteError, match="size"):
+        apply_outline(settings, [(0, 0), (50, 0), (50, 50)])
+
+
+def test_defaults_are_restored_and_nothing_else(settings, regions):
+    settings.quality, settings.resolution, settings.seed, settings.pack = "best", 256, 9, False
+    bpy.ops.material_palette.restore_defaults()
+    assert (settings.quality, settings.resolution, settings.seed, settings.pack) == ("balanced", 1024, 0, True)
+    assert settings.photo is not None and len(regions) == 2
+
+
+def test_tools_of_the_mouse_say_that_they_need_one(settings, regions):
+    with pytest.raises(RuntimeError, match="needs a window"):
+        bpy.ops.material_palette.draw_region(shape="BOX")
+
+
+class Layout:
+    """Stands for the sidebar: refuses what Blender's would only print, and remembers what is said."""
+
+    def __init__(self, said):
+        self.__dict__["said"] = said
+
+    def __setattr__(self, name, value):
+        pass
+
+    def __getattr__(self, name):
+        def call(*arguments, **keywords):
+            if name in {"prop", "template_list"}:
+                data, field = arguments[:2] if name == "prop" else arguments[2:4]
+                assert field in data.bl_rna.properties, field
+                if name == "prop":
+                    self.said.append(keywords.get("text", field))
+            if name == "icon":
+                return 1
+            if name == "operator":
+                module, operator = arguments[0].split(".")
+                rna = getattr(getattr(bpy.ops, module), operator).get_rna_type()
+                self.said.append(keywords.get("text", rna.name))
+                return type("Properties", (), {})()
+            if name == "label":
+                self.said.append(keywords["text"])
+            return Layout(self.said)
+
+        return call
+
+
+@pytest.fixture
+def draw(settings):
+    """draw(): what all panels of the sidebar say now."""
+    from types import SimpleNamespace
+
+    from material_palette.panels import sidebar
+
+    def drawn():
+        said = []
+        context = SimpleNamespace(
+            scene=bpy.context.scene,
+            window_manager=bpy.context.window_manager,
+            preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)),
+            region=SimpleNamespace(width=300),
+            space_data=SimpleNamespace(type="VIEW_3D"),
+        )
+        for section in sidebar._SECTIONS:
+            if not hasattr(section, "poll") or section.poll(context):
+                section.draw(SimpleNamespace(layout=Layout(said)), context)
+        return said
+
+    return drawn
+
+
+def test_the_sidebar_shows_what_there_is(draw, settings, photo_and_masks, make_record, write_maps, tmp_path):
+    from material_palette.core import nodes
+    from material_palette.operators.palette import put_in_palette
+
+    assert "Open Photo" in draw() and "Materials appear here" in draw()
+    photo, masks = photo_and_masks
+    bpy.ops.material_palette.open_photo(filepath=str(photo))
+    bpy.ops.material_palette.import_masks(directory=str(masks))
+    assert "2 regions; the first run tells how long it takes" in draw()
+    settings.regions[0].error = "Region 'left' is empty"
+    assert "Region 'left' is empty" in draw()
+    material = nodes.build_material(make_record(write_maps()), tmp_path, pack=True)
+    put_in_palette(settings, settings.regions[0].key, material).warnings = "over-exposed"
+    for view in ("GRID", "LIST"):
+        settings.palette_view = view
+        said = draw()
+        assert {"Assign", "Assign and Map", "Variation", "tile_size", "roughness_offset", "relief"} <= set(said)
+        assert "Compare" not in said and "over-exposed" in said
+    bpy.data.materials.remove(material)
+    assert "Remove from Palette" in draw()
