@@ -64,6 +64,23 @@ def _parser() -> argparse.ArgumentParser:
     extract.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
     extract.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
     extract.add_argument("--metres-per-tile", type=float, default=1.0, metavar="M", help="size of a repeat (1)")
+    extract.add_argument(
+        "--rectify", default="auto", help="slanted regions: auto, quad (only by corners) or off (auto)"
+    )
+    extract.add_argument(
+        "--corners",
+        action="append",
+        default=[],
+        metavar="NAME:X,Y*4",
+        help="a rectangle on a region's surface in photo px, clockwise from top left: 'floor:10,20 90,20 99,80 2,85'",
+    )
+    extract.add_argument(
+        "--measure",
+        action="append",
+        default=[],
+        metavar="NAME:X,Y*2=M",
+        help="metres between two photo px on a region's surface: 'floor:10,20 90,20=0.6'",
+    )
     extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
     extract.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
     extract.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
@@ -88,17 +105,20 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
     from .image import read_photo
     from .output import staged
     from .palette import Material, Settings, extract_palette, write_palette
-    from .region import read_regions
+    from .region import add_geometry, parse_corners, parse_measure, read_regions
 
     settings = Settings(
         engine=arguments.engine,
         quality=arguments.quality,
         resolution=arguments.resolution,
         seed=arguments.seed,
+        rectify=arguments.rectify,
         flatten=not arguments.no_flatten,
         metres_per_tile=arguments.metres_per_tile,
     )
     settings.check()
+    corners = dict(parse_corners(text) for text in arguments.corners)
+    measures = dict(parse_measure(text) for text in arguments.measure)
     line = _Line(photo_path.name)
     with staged(folder, arguments.overwrite) as staging:
         start = time.perf_counter()
@@ -113,6 +133,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
             from .segmentation import segment
 
             regions = segment(photo.pixels, arguments.segment, arguments.regions, settings.seed, line.progress)
+        add_geometry(regions, corners, measures)
         seconds["regions"] = time.perf_counter() - start
 
         def on_material(material: Material) -> None:
@@ -123,7 +144,9 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
                 for warning in material.warnings:
                     line.say(f"{material.name}: warning: {warning}")
 
-        palette = extract_palette(photo.pixels, regions, settings, line.progress, on_material, photo_path.name)
+        palette = extract_palette(
+            photo.pixels, regions, settings, line.progress, on_material, photo_path.name, photo.focal
+        )
         palette.warnings[:0] = photo.warnings
         palette.seconds = seconds | palette.seconds
         failed = [material for material in palette.materials if material.error]

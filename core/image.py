@@ -13,6 +13,7 @@ import OpenImageIO as oiio
 
 from .errors import PaletteError
 
+FILM_DIAGONAL = 43.27  # mm, of 36 x 24
 MAX_PIXELS = 16_000_000
 LEAST_SIDE = 32  # px; below it there is no neighbourhood to learn a texture from
 ASPECT_TOLERANCE = 0.02
@@ -42,10 +43,14 @@ BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.03
 
 @dataclass
 class Photo:
-    """pixels (H, W, 3) float32 linear Rec.709, >= 0, upright; warnings: what was changed on the way in."""
+    """pixels (H, W, 3) float32 linear Rec.709, >= 0, upright; warnings: what was changed on the way in.
+
+    focal: focal length in px of `pixels`, as the camera wrote it into the file, else None.
+    """
 
     pixels: np.ndarray
     warnings: list[str] = field(default_factory=list)
+    focal: float | None = None
 
 
 def linear_from_srgb(x: np.ndarray) -> np.ndarray:
@@ -112,6 +117,7 @@ def read_photo(
         orientation = spec.get_int_attribute("Orientation", 1)
         upright = _upright(pixels, orientation)
         total = spec.width * spec.height
+        focal = _focal(spec, max(height, width))
     if transparent:
         warnings.append(
             f"{100 * transparent / total:.3g} % of the photo is transparent: the colour stored there is used where a "
@@ -127,7 +133,7 @@ def read_photo(
             f"The photo was reduced from {large[0]} x {large[1]} px to {upright.shape[1]} x {upright.shape[0]} px: "
             f"at most {max_pixels / 1e6:g} megapixels are used."
         )
-    return Photo(upright, warnings)
+    return Photo(upright, warnings, focal)
 
 
 def read_mask(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
@@ -282,6 +288,22 @@ def _profile(spec: "oiio.ImageSpec") -> str:
 def _stored_model(spec: "oiio.ImageSpec") -> str:
     """What a JPEG or TIFF file stores, upper case, such as CMYK; the reader may have made RGB of it."""
     return (spec.get_string_attribute("jpeg:ColorSpace") or spec.get_string_attribute("tiff:ColorSpace")).upper()
+
+
+def _focal(spec: "oiio.ImageSpec", longer: int) -> float | None:
+    """Focal length in px of a picture with so many px on its longer side, from EXIF, None where it is not told."""
+
+    def exif(name: str) -> float:
+        value = spec.getattribute(f"Exif:{name}")
+        return float(value) if isinstance(value, int | float) and 0 < value < 1e6 else 0.0
+
+    # by CIPA's definition the equivalent for 35 mm film goes by the diagonal
+    if exif("FocalLengthIn35mmFilm"):
+        diagonal = float(np.hypot(spec.width, spec.height)) / max(spec.width, spec.height)
+        return exif("FocalLengthIn35mmFilm") / FILM_DIAGONAL * diagonal * longer
+    unit = {2: 25.4, 3: 10.0}.get(int(exif("FocalPlaneResolutionUnit")), 25.4)
+    across = exif("PixelXDimension") or spec.width
+    return (exif("FocalLength") * exif("FocalPlaneXResolution") / unit / across * longer) or None
 
 
 def _linearisation(spec: "oiio.ImageSpec", warnings: list[str]) -> Callable[[np.ndarray], np.ndarray]:

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from . import brdf, decomposition, engines, reduction, sheet
+from . import brdf, decomposition, engines, rectification, reduction, sheet
 from .errors import PaletteError
 from .exemplar import cut_exemplar
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
-from .region import Region, check_region, file_name
+from .region import GEOMETRY, Region, check_region, file_name, region_geometry
 
 VERSION = 1  # of palette.json
 QUALITIES = tuple(engines.patch.ROUNDS)
@@ -33,14 +33,17 @@ Progress = Callable[[float, str], None]
 class Settings:
     """What the user chooses; the same for every region.
 
-    resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object;
-    flatten takes the slow change of illumination out of a region before synthesis.
+    resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object,
+    where a region's measure does not tell; rectify: "auto" brings a slanted region to the front, by its corners or by
+    the plane that is found, "quad" by its corners only, "off" never; flatten takes the slow change of illumination out
+    of a region before synthesis.
     """
 
     engine: str = "patch"
     quality: str = "balanced"
     resolution: int = 1024
     seed: int = 0
+    rectify: str = "auto"
     flatten: bool = True
     metres_per_tile: float = 1.0
 
@@ -55,6 +58,8 @@ class Settings:
             raise PaletteError(f"resolution {self.resolution} px is out of range; choose {least} to {most} px")
         if not 0 <= self.seed < 2**63:
             raise PaletteError(f"seed {self.seed} is out of range; choose a whole number from 0 to 2^63 - 1")
+        if self.rectify not in rectification.MODES:
+            raise PaletteError(f"rectify '{self.rectify}' is unknown; choose one of: {', '.join(rectification.MODES)}")
         if not (0 < self.metres_per_tile < float("inf")):
             raise PaletteError(f"metres per tile is {self.metres_per_tile}; choose a positive length")
 
@@ -64,7 +69,8 @@ class Material:
     """One region's outcome. status is "ok", or "failed" with the reason in error and no SVBRDF.
 
     exemplar (h, w, 3) and texture (H, W, 3) are sRGB-encoded uint8 for looking at; preview (256, 256, 4) float32 is
-    a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced says which maps became values.
+    a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced says which maps became values; rectification
+    is the record for palette.json.
     """
 
     name: str
@@ -75,6 +81,7 @@ class Material:
     seconds: dict[str, float] = field(default_factory=dict)
     error: str | None = None
     metres_per_tile: float = 1.0
+    rectification: dict = field(default_factory=lambda: {"method": "off"})
     exemplar: np.ndarray | None = None
     texture: np.ndarray | None = None
     preview: np.ndarray | None = None
@@ -100,11 +107,13 @@ def extract_palette(
     progress: Progress,
     on_material: Callable[[Material], None] | None = None,
     photo_name: str = "",
+    focal: float | None = None,
 ) -> Palette:
     """Extract one material per region of a photo (H, W, 3) float32 linear.
 
     A region that cannot be extracted becomes a material with status "failed"; the others are finished. on_material is
-    called with each material as soon as it is done. progress may raise Cancelled, which ends the call.
+    called with each material as soon as it is done. focal is the photo's focal length in px where it is known.
+    progress may raise Cancelled, which ends the call.
     Raises PaletteError for settings that cannot be honoured and when there is no region.
     """
     settings.check()
@@ -113,10 +122,15 @@ def extract_palette(
     start = time.perf_counter()
     palette = Palette(pixels, photo_name, regions, settings, [])
     with _one_thread_each():
+        view = None
+        if settings.rectify == "auto" and any(region.corners is None for region in regions):
+            progress(0.0, "looking for lines")
+            with _timed(palette.seconds, "look"):
+                view = rectification.look(pixels, focal)
         for i, region in enumerate(regions):
             share = _part(progress, i / len(regions), (i + 1) / len(regions), f"{region.name}: ")
             try:
-                material = extract_material(pixels, region, settings, share)
+                material = extract_material(pixels, region, settings, share, view, focal)
             except PaletteError as error:
                 material = Material(region.name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
             palette.materials.append(material)
@@ -142,9 +156,17 @@ def _one_thread_each():
         torch.set_num_threads(before)
 
 
-def extract_material(pixels: np.ndarray, region: Region, settings: Settings, progress: Progress) -> Material:
+def extract_material(
+    pixels: np.ndarray,
+    region: Region,
+    settings: Settings,
+    progress: Progress,
+    view: rectification.View | None = None,
+    focal: float | None = None,
+) -> Material:
     """Extract the material of one region of a photo (H, W, 3) float32 linear.
 
+    view is what `rectification.look` finds in the photo, None: it is looked at here; focal as `extract_palette` takes.
     Raises PaletteError for settings that cannot be honoured and for a region too small to hold a texture.
     """
     settings.check()
@@ -153,9 +175,15 @@ def extract_material(pixels: np.ndarray, region: Region, settings: Settings, pro
     material = Material(region.name, metres_per_tile=settings.metres_per_tile)
     seconds = material.seconds
 
-    progress(0.0, "cutting the exemplar")
+    with _timed(seconds, "rectify"):
+        flat = _rectified(pixels, region, settings, view, focal, progress)
+        material.warnings += flat.warnings
+        material.rectification = flat.record()
+        if region.measure is not None:
+            material.metres_per_tile = settings.resolution * rectification.metres_per_texel(*region.measure, flat)
+    progress(0.02, "cutting the exemplar")
     with _timed(seconds, "exemplar"):
-        exemplar = cut_exemplar(pixels, region.mask, settings.flatten)
+        exemplar = cut_exemplar(flat.pixels, flat.mask, settings.flatten)
         encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
         material.warnings += exemplar.warnings
         material.exemplar = sheet.thumbnail(np.where(exemplar.mask[..., None], encoded, 0.1))
@@ -165,7 +193,7 @@ def extract_material(pixels: np.ndarray, region: Region, settings: Settings, pro
         svbrdf = decomposition.constant(exemplar.uniform)
     else:
         with _timed(seconds, "learn"):
-            concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.02, 0.06))
+            concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.03, 0.06))
         with _timed(seconds, "sample"):
             size = settings.resolution, settings.resolution
             texture = engine.sample(concept, size, settings.seed, _part(progress, 0.06, 0.86), settings.quality)
@@ -183,6 +211,15 @@ def extract_material(pixels: np.ndarray, region: Region, settings: Settings, pro
     return material
 
 
+def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
+    if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
+        return rectification.Rectification(pixels, region.mask)
+    progress(0.0, "rectifying")
+    if region.corners is not None:
+        return rectification.rectify_corners(pixels, region.mask, region.corners, focal)
+    return rectification.rectify(pixels, region.mask, view or rectification.look(pixels, focal))
+
+
 def write_material(material: Material, folder: Path) -> dict:
     """Write a material's maps and its .json into `folder` (made if missing); return its record for palette.json.
 
@@ -194,6 +231,7 @@ def write_material(material: Material, folder: Path) -> dict:
         "status": material.status,
         "maps": {},
         "metres_per_tile": material.metres_per_tile,
+        "rectification": material.rectification,
         "seconds": {stage: round(s, 3) for stage, s in material.seconds.items()},
         "reduced": material.reduced,
         "warnings": material.warnings,
@@ -245,6 +283,7 @@ def write_palette(
     (folder / "masks").mkdir()
     for region in palette.regions:
         write_image(folder / "masks" / f"{file_name(region.name)}.png", region.mask.astype(np.float32))
+    _write_geometry(palette.regions, folder / "masks")
     progress(0.85, "writing the contact sheet")
     write_image(folder / "palette.png", sheet.contact_sheet(palette))
     seconds = palette.seconds | {"write": time.perf_counter() - start}
@@ -259,6 +298,13 @@ def write_palette(
     _write_json(folder / "palette.json", content)
     progress(1.0, "written")
     return content
+
+
+def _write_geometry(regions: list[Region], folder: Path) -> None:
+    """The regions' corners and measures beside their masks, as `region.read_regions` reads them."""
+    content = {region.name: geometry for region in regions if (geometry := region_geometry(region))}
+    if content:
+        _write_json(folder / GEOMETRY, content)
 
 
 def _write_json(path: Path, content: dict) -> None:

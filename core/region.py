@@ -1,5 +1,6 @@
 """Regions: the named parts of a photo whose materials are wanted."""
 
+import json
 import re
 import unicodedata
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from .image import read_mask
 
 LEAST_AREA = 24 * 24  # px
 LEAST_RADIUS = 3  # px of the largest disc inside; below it no neighbourhood lies within the region
+GEOMETRY = "regions.json"  # beside the masks: corners and measures by region
 LONGEST_FILE_NAME = 100  # bytes; leaves room for suffixes and folders within what Windows takes
 MASK_SUFFIXES = frozenset(
     ".png .jpg .jpeg .jpe .tif .tiff .bmp .tga .exr .hdr .webp .gif .pbm .pgm .ppm .pnm .pfm .psd .psb .jp2 .dpx .sgi "
@@ -23,16 +25,23 @@ WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])(\.
 
 @dataclass
 class Region:
-    """A named part of the photo: mask (H, W) bool, of the photo's height and width."""
+    """A named part of the photo: mask (H, W) bool, of the photo's height and width.
+
+    corners (4, 2): photo px (x, y) of a rectangle on the surface, clockwise from its top left, or None; measure: two
+    photo px (2, 2) on the surface and the metres between them, or None.
+    """
 
     name: str
     mask: np.ndarray
+    corners: np.ndarray | None = None
+    measure: tuple[np.ndarray, float] | None = None
 
 
 def read_regions(folder: str | Path, shape: tuple[int, int]) -> list[Region]:
     """One region per mask image in `folder`, named as its file without suffix, sorted by name, of the shape (H, W).
 
-    Hidden files, folders and files without an image's suffix are passed over.
+    Corners and measures come from the file GEOMETRY beside them, if there is one. Hidden files, folders and other files
+    without an image's suffix are passed over.
     Raises PaletteError for a folder that is missing or holds no mask, for two masks whose files of maps would have one
     name on some system, and for what `read_mask` refuses.
     """
@@ -58,7 +67,85 @@ def read_regions(folder: str | Path, shape: tuple[int, int]) -> list[Region]:
             raise PaletteError(
                 f"Masks '{owner.name}' and '{file.name}' in '{folder}' would name one material. Rename or remove one."
             )
-    return [Region(_readable(file.stem), read_mask(file, shape)) for file in files]
+    regions = [Region(_readable(file.stem), read_mask(file, shape)) for file in files]
+    if (folder / GEOMETRY).is_file():
+        _read_geometry(folder / GEOMETRY, regions)
+    return regions
+
+
+def parse_corners(text: str) -> tuple[str, np.ndarray]:
+    """(region, corners) of "region:x,y x,y x,y x,y". Raises PaletteError."""
+    name, _, points = text.rpartition(":")
+    return _readable(name), _points(points.split(), 4, text, "NAME:X,Y X,Y X,Y X,Y")
+
+
+def parse_measure(text: str) -> tuple[str, tuple[np.ndarray, float]]:
+    """(region, measure) of "region:x,y x,y=metres". Raises PaletteError."""
+    name, _, rest = text.rpartition(":")
+    points, _, metres = rest.partition("=")
+    usage = "NAME:X,Y X,Y=METRES"
+    return _readable(name), (_points(points.split(), 2, text, usage), _metres(metres, text, usage))
+
+
+def add_geometry(regions: list[Region], corners: dict, measures: dict) -> None:
+    """Give regions their corners and measures, by name. Raises PaletteError for a name that no region has."""
+    by_name = {region.name: region for region in regions}
+    for name in [*corners, *measures]:
+        if name not in by_name:
+            raise PaletteError(f"there is no region '{name}'; choose one of: {', '.join(by_name)}")
+    for name, found in corners.items():
+        by_name[name].corners = found
+    for name, found in measures.items():
+        by_name[name].measure = found
+
+
+def region_geometry(region: Region) -> dict:
+    """A region's corners and measure as `GEOMETRY` holds them; empty without either."""
+    found = {}
+    if region.corners is not None:
+        found["corners"] = np.asarray(region.corners, float).tolist()
+    if region.measure is not None:
+        points, metres = region.measure
+        found["measure"] = {"points": np.asarray(points, float).tolist(), "metres": metres}
+    return found
+
+
+def _read_geometry(file: Path, regions: list[Region]) -> None:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        corners = {n: g["corners"] for n, g in content.items() if "corners" in g}
+        measures = {n: (g["measure"]["points"], g["measure"]["metres"]) for n, g in content.items() if "measure" in g}
+        usage = "points [x, y], four as corners and two as a measure"
+        corners = {n: _points(c, 4, str(c), usage) for n, c in corners.items()}
+        measures = {n: (_points(p, 2, str(p), usage), _metres(m, str(m), "a length")) for n, (p, m) in measures.items()}
+        add_geometry(regions, corners, measures)
+    except PaletteError as error:
+        raise PaletteError(f"'{file}': {error}") from None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise PaletteError(
+            f"'{file}' can't be read ({error}). It holds, by region, \"corners\": four [x, y] and "
+            f'"measure": {{"points": two [x, y], "metres": number}}.'
+        ) from None
+
+
+def _points(values: list, count: int, text: str, usage: str) -> np.ndarray:
+    try:
+        points = np.array([v.split(",") if isinstance(v, str) else v for v in values], np.float64)
+    except (ValueError, TypeError):
+        points = None
+    if points is None or points.shape != (count, 2) or not np.isfinite(points).all():
+        raise PaletteError(f"'{text}' is not {usage}")
+    return points
+
+
+def _metres(value: str | float, text: str, usage: str) -> float:
+    try:
+        metres = float(value)
+    except (ValueError, TypeError):
+        metres = float("nan")
+    if not 0 < metres < float("inf"):
+        raise PaletteError(f"'{text}' is not {usage}: the length is a positive number of metres")
+    return metres
 
 
 def check_region(region: Region) -> None:

@@ -1,0 +1,454 @@
+"""Rectification: a region of a slanted plane, resampled as if the camera had faced it.
+
+The plane comes from the user's four corners, from a camera and an object, or is found: of all planes the one under
+which the texture's local spectra agree (`texture_gradient`) and straight lines run in few directions (`vanishing`).
+Where neither says enough, the region stays as it is.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from .errors import PaletteError
+from .exemplar import LARGEST, LUMINANCE
+from .image import srgb_from_linear
+from .texture_gradient import gradient_scores, local_spectra, plane_axes
+from .vanishing import Segments, find_focal, find_frame, find_segments, line_score
+
+MODES = ("off", "auto", "quad")
+DEFAULT_FOCAL = 1.0  # in longer sides of the photo: 53 degrees, between a telephone's camera and a normal lens
+LOOKED_AT = 512  # px: side of the square with the region's area when its plane is sought
+LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
+STEEPEST = 80.0  # degrees
+LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
+ENOUGH_LINES = 100
+LEAST_CONFIDENCE = 0.5
+SHARE = 0.5  # of the exemplar's texel density, below which a part is seen too obliquely
+MOST_SAMPLES = 4  # per texel and axis
+DARKEST = 1e-3
+
+
+@dataclass
+class View:
+    """What a photo tells about its camera: focal length in px, whether it is known, the straight segments."""
+
+    focal: float
+    known: bool
+    segments: Segments
+
+
+@dataclass
+class Rectification:
+    """A region ready to be cut.
+
+    pixels (h, w, 3) float32 linear and mask (h, w) bool; homography (3, 3): from its px to the photo's px, None where
+    the region was left as it is; method: "off", "corners", "auto" or "plane"; normal (3,): unit, towards the camera,
+    camera coordinates (x right, y down, z forward), None when not known; slant in degrees between it and the optical
+    axis; confidence 0 to 1.
+    """
+
+    pixels: np.ndarray
+    mask: np.ndarray
+    homography: np.ndarray | None = None
+    method: str = "off"
+    normal: np.ndarray | None = None
+    confidence: float = 0.0
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def slant(self) -> float | None:
+        return None if self.normal is None else float(np.degrees(np.arccos(np.clip(-self.normal[2], -1, 1))))
+
+    def record(self) -> dict:
+        """What palette.json holds of it."""
+        record = {"method": self.method, "confidence": round(self.confidence, 3)}
+        if self.normal is not None:
+            record |= {"slant_degrees": round(self.slant, 2), "normal": [round(float(n), 5) for n in self.normal]}
+        if self.homography is not None:
+            record["homography"] = [[float(f"{v:.9g}") for v in row] for row in self.homography]
+        return record
+
+
+@dataclass
+class PlaneEstimate:
+    """gradient (2,): the plane has the inverse depth 1 + g.x over normalised image coordinates; confidence 0 to 1."""
+
+    gradient: np.ndarray
+    confidence: float
+    evidence: dict[str, float]
+
+    @property
+    def slant(self) -> float:
+        return float(np.degrees(np.arctan(np.linalg.norm(self.gradient))))
+
+
+def look(pixels: np.ndarray, focal: float | None = None) -> View:
+    """Find a photo's segments and, unless it is given in px, its focal length. pixels (H, W, 3) float32 linear."""
+    segments = find_segments(srgb_from_linear(np.clip(pixels @ LUMINANCE, 0, 1)))
+    if focal is not None:
+        return View(float(focal), True, segments)
+    found = find_focal(segments, pixels.shape[:2])
+    return View(found or DEFAULT_FOCAL * max(pixels.shape[:2]), found is not None, segments)
+
+
+def rectify_corners(
+    pixels: np.ndarray, mask: np.ndarray, corners: np.ndarray, focal: float | None = None
+) -> Rectification:
+    """Rectify a region of a photo by four points of a rectangle on its surface.
+
+    pixels (H, W, 3) float32 linear; mask (H, W) bool; corners (4, 2): photo px (x, y), clockwise as seen, beginning
+    with the top left one; focal in px where it is known. Raises PaletteError for corners that are no view of a
+    rectangle and when nothing of the region is left.
+    """
+    to_photo, normal = plane_of_corners(corners, pixels.shape[:2], focal)
+    return resample(pixels, mask, to_photo, "corners", normal)
+
+
+def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
+    """Rectify a region of a photo by the plane that is found, if it is.
+
+    pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel; view as `look` finds it. A region that is
+    seen from the front, or of which nothing certain is found, is returned as it is.
+    """
+    estimate = find_plane(pixels, mask, view)
+    if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
+        warning = "the slant of the region could not be told; it is used as the photo shows it"
+        return Rectification(pixels, mask, confidence=estimate.confidence if estimate else 0.0, warnings=[warning])
+    if estimate.slant < LEAST_SLANT:
+        return Rectification(pixels, mask, normal=_normal(estimate.gradient), confidence=estimate.confidence)
+    where = np.array(_centroid(mask))
+    to_photo = plane_to_photo(estimate.gradient, view.focal, _principal_point(mask.shape), where)
+    turn = _turn(view.segments.within(mask), to_photo)
+    return resample(pixels, mask, to_photo @ turn, "auto", _normal(estimate.gradient), estimate.confidence)
+
+
+# ---------------------------------------------------------------- the plane
+
+
+def plane_of_corners(
+    corners: np.ndarray, shape: tuple[int, int], focal: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Homography (3, 3) from a plane, in units of the rectangle's width, to photo px, and the plane's normal (3,).
+
+    corners (4, 2) as `rectify` takes them; shape (H, W) of the photo; focal in px, None: found from the corners where
+    perspective shows, else DEFAULT_FOCAL. The rectangle's proportions follow from it (Zhang and He 2007).
+    """
+    corners = np.asarray(corners, np.float64)
+    if corners.shape != (4, 2) or not np.isfinite(corners).all():
+        raise PaletteError("a region's corners are four points x,y in photo px")
+    sides = np.roll(corners, -1, 0) - corners
+    turns = sides[:, 0] * np.roll(sides[:, 1], -1) - sides[:, 1] * np.roll(sides[:, 0], -1)
+    if turns.min() < 0.05 * np.abs(turns).max() or turns.min() < 4:
+        raise PaletteError(
+            "the corners are no view of a rectangle: give four points around it, clockwise from its top left corner"
+        )
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    centre = _principal_point(shape)
+    h = cv2.getPerspectiveTransform(square, (corners - centre).astype(np.float32)).astype(np.float64)
+    longer = max(shape)
+    if focal is None:
+        focal = DEFAULT_FOCAL * longer
+        both = h[2, 0] * h[2, 1]
+        if abs(both) * longer**2 > 0.02 * abs(h[0, 0] * h[1, 1]) and both:
+            squared = -(h[0, 0] * h[0, 1] + h[1, 0] * h[1, 1]) / both
+            if (0.4 * longer) ** 2 < squared < (4 * longer) ** 2:
+                focal = float(np.sqrt(squared))
+    axes = h[:, :2] / [[focal], [focal], [1]]
+    width, height = np.linalg.norm(axes, axis=0)
+    h = h @ np.diag([1.0, width / height, 1.0])
+    h[:2] += np.outer(centre, h[2])
+    normal = np.cross(axes[:, 0], axes[:, 1])
+    normal *= -np.sign(normal[2]) / np.linalg.norm(normal)
+    return h, normal
+
+
+def plane_of_camera(
+    normal: np.ndarray, focal: float, centre: tuple[float, float], where: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Homography (3, 3) from a plane to photo px, and its normal towards the camera, for `resample`.
+
+    normal (3,): of the surface, either side, camera coordinates (x right, y down, z forward); focal and principal point
+    (x, y) in photo px; where: the photo px (x, y) that becomes the plane's origin. Raises PaletteError for a plane that
+    is seen edge on there.
+    """
+    normal = np.asarray(normal, np.float64) / np.linalg.norm(normal)
+    ray = np.append((np.asarray(where, float) - centre) / focal, 1.0)
+    if abs(normal @ ray) < np.cos(np.radians(88)) * np.linalg.norm(ray) or abs(normal[2]) < 1e-3:
+        raise PaletteError("the surface is seen edge on; nothing of it can be rectified")
+    normal = -normal * np.sign(normal @ ray)
+    return plane_to_photo(normal[:2] / normal[2], focal, centre, where), normal
+
+
+def plane_to_photo(gradient: np.ndarray, focal: float, centre: tuple[float, float], where) -> np.ndarray:
+    """Homography (3, 3) from the plane with inverse depth 1 + g.x, its origin at `where`, to photo px."""
+    gradient = np.asarray(gradient, np.float64)
+    ray = np.append((np.asarray(where, float) - centre) / focal, 1.0)
+    # the point of the plane, which lies at depth 1 on the axis, under `where`
+    origin = ray / (1 + gradient @ ray[:2])
+    h = np.column_stack([*plane_axes(gradient), origin / abs(origin[2])])
+    camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+    return camera @ h
+
+
+def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimate | None:
+    """The plane of a region from its texture and lines; None where there is neither."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    scale = min(1.0, LOOKED_AT / float(mask.sum()) ** 0.5)
+    size = max(1, round((box[1].stop - box[1].start) * scale)), max(1, round((box[0].stop - box[0].start) * scale))
+    grey = cv2.resize(np.ascontiguousarray(pixels[box] @ LUMINANCE), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(mask[box].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    centre = np.array(_principal_point(mask.shape))
+    own = ((centre - (box[1].start, box[0].start)) + 0.5) * scale - 0.5
+    spectra = local_spectra(np.log(grey + DARKEST), small, view.focal * scale, tuple(own))
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    segments = view.segments.within(inside)
+    enough = min(len(segments.ends), ENOUGH_LINES) / ENOUGH_LINES
+    frame = find_frame(segments, view.focal, tuple(centre))
+    if spectra is None:
+        return None
+    starts = _starts()
+    if frame is not None and abs(frame.axes[2, 2]) > 0.15:
+        starts.append(frame.axes[2, :2] / frame.axes[2, 2])
+
+    def score(gradient: np.ndarray) -> np.ndarray | None:
+        scores = gradient_scores(spectra, gradient)
+        if scores is None:
+            return None
+        return scores + LINES_WEIGHT * enough * line_score(segments, gradient, view.focal, tuple(centre))
+
+    planes, scores = _search(score, starts)
+    best = scores[:, 0].argmax()
+    away = np.array([_between(planes[best], g) for g in planes])
+    others = np.array([away[i] for i in scores[:, 1:].argmax(0)])
+    evidence = {
+        "gain": float(scores[best, 0] - scores[0, 0]),
+        "spread": float(np.sqrt((others**2).mean())),
+        "margin": float(scores[best, 0] - scores[away > 20, 0].max()) if (away > 20).any() else 1.0,
+        "windows": len(spectra.at),
+        "lines": len(segments.ends),
+        "level": float(scores[0, 0]),
+    }
+    return PlaneEstimate(planes[best], _confidence(evidence), evidence)
+
+
+def _confidence(evidence: dict[str, float]) -> float:
+    return float(evidence["gain"] > 0.15 and evidence["spread"] < 8 and evidence["margin"] > 0.05)
+
+
+def _starts() -> list[np.ndarray]:
+    """Gradients about 14 degrees apart, from the front on."""
+    found = [np.zeros(2)]
+    for ring, (slant, count) in enumerate([(14, 8), (28, 12), (42, 14), (54, 16), (64, 16), (72, 16)]):
+        tilt = (np.arange(count) + 0.5 * (ring % 2)) * 2 * np.pi / count
+        found += list(np.tan(np.radians(slant)) * np.stack([np.cos(tilt), np.sin(tilt)], -1))
+    return found
+
+
+def _search(score, starts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """All planes tried (k, 2), the first start first, and their scores (k, s); the two best starts are refined."""
+    planes, scores = [], []
+
+    def tried(gradient: np.ndarray) -> float:
+        found = score(gradient)
+        if found is None:
+            return -np.inf
+        planes.append(gradient)
+        scores.append(found)
+        return float(found[0])
+
+    values = [tried(g) for g in starts]
+    first = starts[int(np.argmax(values))]
+    apart = [v if _between(first, g) > 15 else -np.inf for g, v in zip(starts, values, strict=True)]
+    for start in (int(np.argmax(values)), int(np.argmax(apart))):
+        gradient, best = starts[start], values[start]
+        for step in (7.0, 3.5, 1.8, 0.9):
+            around = [_tilted(gradient, step, i * np.pi / 3 + step) for i in range(6)]
+            around = [(tried(g), g) for g in around if np.linalg.norm(g) < np.tan(np.radians(STEEPEST))]
+            if around:
+                value, near = max(around, key=lambda pair: pair[0])
+                if value > best:
+                    gradient, best = near, value
+    return np.array(planes), np.array(scores)
+
+
+def _tilted(gradient: np.ndarray, degrees: float, towards: float) -> np.ndarray:
+    """The gradient of the plane tilted further by some degrees, in a direction (radians) of its own."""
+    right, down = plane_axes(gradient)
+    away = np.append(gradient, 1.0) / np.sqrt(1 + gradient @ gradient)
+    away = away + np.tan(np.radians(degrees)) * (np.cos(towards) * right + np.sin(towards) * down)
+    return away[:2] / max(away[2], 1e-3)
+
+
+def _between(first: np.ndarray, second: np.ndarray) -> float:
+    """Degrees between the planes of two gradients."""
+    cosine = (1 + first @ second) / np.sqrt((1 + first @ first) * (1 + second @ second))
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _normal(gradient: np.ndarray) -> np.ndarray:
+    return -np.append(gradient, 1.0) / np.sqrt(1 + gradient @ gradient)
+
+
+def _principal_point(shape: tuple[int, int]) -> tuple[float, float]:
+    return (shape[1] - 1) / 2, (shape[0] - 1) / 2
+
+
+def _centroid(mask: np.ndarray) -> tuple[float, float]:
+    y, x = np.nonzero(mask)
+    return float(x.mean()), float(y.mean())
+
+
+def _turn(segments: Segments, to_photo: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of the plane that lays its lines along rows and columns; unity where they have no direction."""
+    if len(segments.ends) < 8:
+        return np.eye(3)
+    ends = _mapped(np.linalg.inv(to_photo), segments.ends.reshape(-1, 2)).reshape(-1, 2, 2)
+    step = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(step, axis=1)
+    quadruple = (length * np.exp(4j * np.arctan2(step[:, 1], step[:, 0]))).sum() / length.sum()
+    if abs(quadruple) < 0.5:
+        return np.eye(3)
+    angle = np.angle(quadruple) / 4
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def metres_per_texel(points: np.ndarray, metres: float, rectification: Rectification) -> float:
+    """Metres that one px of a rectified region covers; points (2, 2): photo px (x, y) `metres` apart on its surface."""
+    points = np.asarray(points, np.float64)
+    if rectification.homography is not None:
+        points = _mapped(np.linalg.inv(rectification.homography), points)
+    length = float(np.linalg.norm(points[1] - points[0]))
+    if not (0 < metres < np.inf) or not 0.5 < length < np.inf:
+        raise PaletteError("a measure is two different points of the surface and a positive length in metres")
+    return metres / length
+
+
+# ---------------------------------------------------------------- resampling
+
+
+def resample(
+    pixels: np.ndarray,
+    mask: np.ndarray,
+    to_photo: np.ndarray,
+    method: str = "plane",
+    normal: np.ndarray | None = None,
+    confidence: float = 1.0,
+) -> Rectification:
+    """Resample a region onto its plane.
+
+    to_photo (3, 3): homography from the plane, any unit, to photo px. A texel is as large as the photo shows most of
+    the region at least: of all texel sizes, the one at which the photo has the most texels of its own. What is seen
+    more obliquely than SHARE of that is left out, and of what is larger than LARGEST the fullest part is taken.
+    Raises PaletteError when nothing remains.
+    """
+    y, x = np.nonzero(mask)
+    some = slice(None, None, max(1, len(x) // 50_000))
+    points = np.stack([x, y], -1)[some].astype(float)
+    density, facing = _density(np.linalg.inv(to_photo), points)
+    # from the densest on, the plane's area that is seen at least so densely
+    area = np.abs(np.linalg.det(np.linalg.inv(to_photo))) / _denominator(np.linalg.inv(to_photo), points) ** 3
+    good = facing & np.isfinite(density) & (density > 0)
+    if not good.any():
+        raise PaletteError("the region lies beyond the horizon of its plane; give other corners or turn rectify off")
+    order = np.argsort(-density[good], kind="stable")
+    texels = np.cumsum(np.abs(area[good][order])) * density[good][order] ** 2
+    scale = float(density[good][order][texels.argmax()])
+    kept = good & (density >= SHARE * scale)
+    low, high = (f(_mapped(np.linalg.inv(to_photo), points[kept]), 0) for f in (np.min, np.max))
+    side = (high - low) * scale + 2
+    to_plane = np.array([[1 / scale, 0, low[0]], [0, 1 / scale, low[1]], [0, 0, 1]])
+    warnings = []
+    if side.max() > LARGEST:
+        to_plane = to_plane @ _fullest_window(mask, to_photo @ to_plane, side)
+        warnings.append(
+            f"rectified, the region spreads over {side[0]:.0f} x {side[1]:.0f} px; the fullest {LARGEST} px are used"
+        )
+        side = np.minimum(side, LARGEST)
+    w, h = (max(1, int(np.ceil(n))) for n in side)
+    homography = to_photo @ to_plane
+    homography /= homography[2, 2]
+    flat = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(float)
+    within = np.zeros(h * w, bool)
+    for part in range(0, len(flat), 1 << 18):
+        at = flat[part : part + (1 << 18)]
+        back = _mapped(homography, at)
+        texels, facing = _density(np.linalg.inv(homography), back)
+        inside = (back >= 0).all(1) & (back <= [mask.shape[1] - 1, mask.shape[0] - 1]).all(1)
+        column, row = np.rint(np.where(inside[:, None], back, 0)).astype(int).T
+        within[part : part + (1 << 18)] = inside & facing & (texels >= SHARE) & mask[row, column]
+    within = within.reshape(h, w)
+    if not within.any():
+        raise PaletteError("the region is seen too obliquely to be rectified; paint a nearer part of it")
+    lost = 1 - within.sum() / max(1.0, np.abs(area[good]).sum() * scale**2 * len(x) / len(points))
+    if lost > 0.5:
+        warnings.append(f"{lost:.0%} of the region's surface is seen too obliquely and left out")
+    return Rectification(
+        _warp(pixels, homography, (h, w), within), within, homography, method, normal, confidence, warnings
+    )
+
+
+def _warp(pixels: np.ndarray, homography: np.ndarray, size: tuple[int, int], within: np.ndarray) -> np.ndarray:
+    """Pixels (h, w, 3) under a homography to photo px; where several photo px fall on a texel, their mean."""
+    h, w = size
+    y, x = np.nonzero(within)
+    some = slice(None, None, max(1, len(x) // 5000))
+    step = np.stack([x, y], -1)[some].astype(float)
+    here = _mapped(homography, step)
+    reach = max(np.linalg.norm(_mapped(homography, step + d) - here, axis=1).max() for d in ((1, 0), (0, 1)))
+    samples = int(np.clip(np.ceil(reach), 1, MOST_SAMPLES))
+    finer = np.array([[1 / samples, 0, 0.5 / samples - 0.5], [0, 1 / samples, 0.5 / samples - 0.5], [0, 0, 1]])
+    result = np.empty((h, w, 3), np.float32)
+    for top in range(0, h, 256):
+        rows = min(256, h - top)
+        down = np.array([[1, 0, 0], [0, 1, top], [0, 0, 1]])
+        band = cv2.warpPerspective(
+            pixels,
+            homography @ down @ finer,
+            (w * samples, rows * samples),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        result[top : top + rows] = cv2.resize(band, (w, rows), interpolation=cv2.INTER_AREA) if samples > 1 else band
+    return np.maximum(result, 0)
+
+
+def _fullest_window(mask: np.ndarray, homography: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Translation (3, 3) to the LARGEST x LARGEST px of the rectified picture that hold most of the mask."""
+    shrink = max(1.0, float(side.max()) / 512)
+    w, h = (max(1, int(n / shrink)) for n in side)
+    small = cv2.warpPerspective(
+        mask.astype(np.uint8),
+        homography @ np.diag([shrink, shrink, 1]),
+        (w, h),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+    )
+    width, height = (min(n, int(LARGEST / shrink)) for n in (w, h))
+    total = cv2.integral(small)
+    count = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    top, left = np.unravel_index(count.argmax(), count.shape)
+    return np.array([[1, 0, left * shrink], [0, 1, top * shrink], [0, 0, 1]])
+
+
+def _mapped(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (n, 2) under a homography."""
+    h = points @ homography[:, :2].T + homography[:, 2]
+    return h[:, :2] / h[:, 2:]
+
+
+def _denominator(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ homography[2, :2] + homography[2, 2]
+
+
+def _density(to_plane: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Photo px per unit of the plane in the worst direction (n,) at photo points, and whether they face the camera."""
+    bottom = _denominator(to_plane, points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = (points @ to_plane[:2, :2].T + to_plane[:2, 2]) / bottom[:, None]
+        j = (to_plane[None, :2, :2] - at[:, :, None] * to_plane[2, None, None, :2]) / bottom[:, None, None]
+        # the largest singular value of a 2 x 2 matrix
+        square, det = (j**2).sum((1, 2)), j[:, 0, 0] * j[:, 1, 1] - j[:, 0, 1] * j[:, 1, 0]
+        stretch = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * det**2, 0))) / 2)
+        return 1 / stretch, det > 0

@@ -1,0 +1,169 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+from material_palette.core import rectification
+from material_palette.core.errors import PaletteError
+from material_palette.core.image import read_photo
+from material_palette.core.palette import Settings, extract_palette
+from material_palette.core.region import Region, parse_corners, parse_measure, read_regions
+from textures import pebbles, quiet
+
+FOCAL = 1.1  # in sides of the photo
+
+
+def slanted(texture, gradient, side=384, density=1.0):
+    """A square photo of the plane with inverse depth 1 + g.x, and what of it is surface."""
+    centre = ((side - 1) / 2,) * 2
+    to_photo = rectification.plane_to_photo(np.asarray(gradient, float), FOCAL * side, centre, centre)
+    size = len(texture)
+    # the plane's origin lies in the middle of the texture; 4 x 4 samples a px
+    fine = 4
+    shift = np.array([[FOCAL * side * density, 0, size / 2], [0, FOCAL * side * density, size / 2], [0, 0, 1]])
+    from_fine = np.array([[1 / fine, 0, 0.5 / fine - 0.5], [0, 1 / fine, 0.5 / fine - 0.5], [0, 0, 1]])
+    back = shift @ np.linalg.inv(to_photo) @ from_fine
+    wide = cv2.warpPerspective(
+        texture, back, (side * fine,) * 2, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_WRAP
+    )
+    return cv2.resize(wide, (side, side), interpolation=cv2.INTER_AREA)
+
+
+def tilted(slant, towards):
+    return np.tan(np.radians(slant)) * np.array([np.cos(towards), np.sin(towards)])
+
+
+def bricks(side=512):
+    picture = pebbles(side, side) * 0.15 + 0.5
+    for row in range(0, side, 32):
+        picture[row : row + 3] = 0.1
+        for column in range(row % 64, side, 64):
+            picture[row : row + 32, column : column + 3] = 0.1
+    return picture.astype(np.float32)
+
+
+def view_of(pixels):
+    return rectification.look(pixels, FOCAL * len(pixels))
+
+
+@pytest.mark.parametrize("texture", [pebbles(512, 512), bricks()], ids=["pebbles", "bricks"])
+def test_the_plane_of_a_texture_is_found(texture):
+    gradient = tilted(50, 1.2)
+    pixels = slanted(texture, gradient)
+    found = rectification.rectify(pixels, np.ones(pixels.shape[:2], bool), view_of(pixels))
+    truth = -np.append(gradient, 1) / np.sqrt(1 + gradient @ gradient)
+    assert found.method == "auto"
+    assert np.degrees(np.arccos(found.normal @ truth)) < 8
+
+
+def test_a_region_seen_from_the_front_stays_bit_for_bit():
+    pixels, mask = pebbles(384, 384), np.ones((384, 384), bool)
+    found = rectification.rectify(pixels, mask, view_of(pixels))
+    assert found.homography is None and np.array_equal(found.pixels, pixels) and np.array_equal(found.mask, mask)
+
+
+def test_noise_on_a_plain_wall_is_no_plane():
+    pixels = 0.5 + 0.002 * np.random.default_rng(0).standard_normal((384, 384, 3)).astype(np.float32)
+    found = rectification.rectify(pixels, np.ones((384, 384), bool), view_of(pixels))
+    assert found.method == "off"
+
+
+def corners_in_photo(gradient, rectangle, side=384):
+    centre = ((side - 1) / 2,) * 2
+    to_photo = rectification.plane_to_photo(np.asarray(gradient, float), FOCAL * side, centre, centre)
+    points = np.append(np.array(rectangle, float), np.ones((4, 1)), 1) @ to_photo.T
+    return points[:, :2] / points[:, 2:]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_four_corners_give_normal_and_proportions(known):
+    gradient = tilted(45, 0.7)
+    rectangle = [(-0.3, -0.1), (0.3, -0.1), (0.3, 0.1), (-0.3, 0.1)]  # 3 : 1
+    corners = corners_in_photo(gradient, rectangle)
+    to_photo, normal = rectification.plane_of_corners(corners, (384, 384), FOCAL * 384 if known else None)
+    truth = -np.append(gradient, 1) / np.sqrt(1 + gradient @ gradient)
+    assert np.degrees(np.arccos(np.clip(normal @ truth, -1, 1))) < 0.1
+    back = np.linalg.inv(to_photo) @ np.append(corners, np.ones((4, 1)), 1).T
+    back = (back[:2] / back[2]).T
+    assert back == pytest.approx(np.array([[0, 0], [1, 0], [1, 1 / 3], [0, 1 / 3]]), abs=1e-3)
+
+
+def test_rectified_by_corners_the_texture_is_the_flat_one():
+    texture, gradient = cv2.GaussianBlur(pebbles(512, 512), (0, 0), 2), tilted(40, 0)
+    pixels = slanted(texture, gradient)
+    corners = corners_in_photo(gradient, [(-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)])
+    mask = np.zeros((384, 384), np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(corners).astype(np.int32), 1)
+    found = rectification.rectify_corners(pixels, mask > 0, corners, FOCAL * 384)
+    centre = ((384 - 1) / 2,) * 2
+    to_texture = np.array([[FOCAL * 384, 0, 256], [0, FOCAL * 384, 256], [0, 0, 1]])
+    to_texture = to_texture @ np.linalg.inv(rectification.plane_to_photo(gradient, FOCAL * 384, centre, centre))
+    to_texture = to_texture @ found.homography
+    to_texture /= to_texture[2, 2]
+    similarity = to_texture[:2, :2]
+    # square texels, no smaller than the photo's own px
+    assert np.abs(to_texture[2, :2]).max() < 1e-5
+    assert similarity.T @ similarity / similarity[0, 0] ** 2 == pytest.approx(np.eye(2), abs=0.01)
+    assert similarity[0, 0] > 1
+    h, w = found.mask.shape
+    flat = cv2.warpPerspective(texture, to_texture, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    inside = cv2.erode(found.mask.astype(np.uint8), np.ones((9, 9))) > 0
+    assert np.corrcoef(found.pixels[inside].ravel(), flat[inside].ravel())[0, 1] > 0.97
+
+
+def test_what_is_seen_too_obliquely_is_left_out():
+    pixels, mask = slanted(pebbles(512, 512), tilted(65, np.pi / 2)), np.ones((384, 384), bool)
+    mask[:20] = False
+    centre = (191.5, 191.5)
+    to_photo = rectification.plane_to_photo(tilted(65, np.pi / 2), FOCAL * 384, centre, centre)
+    found = rectification.resample(pixels, mask, to_photo)
+    y, x = np.nonzero(found.mask)
+    points = np.stack([x, y, np.ones_like(x)]).astype(float)
+    back = found.homography @ points
+    rows = back[1] / back[2]
+    assert rows.min() > 60 and rows.max() > 360  # the far part is gone, the near one kept
+
+
+@pytest.mark.parametrize("corners", [[(0, 0), (0, 9), (9, 9), (9, 0)], [(0, 0), (9, 0), (5, 1), (0, 9)], [(0, 0)] * 4])
+def test_corners_of_no_rectangle_are_refused(corners):
+    with pytest.raises(PaletteError, match="clockwise"):
+        rectification.plane_of_corners(np.array(corners, float) * 20, (200, 200))
+
+
+def test_a_measure_sets_the_size_of_a_tile():
+    pixels = pebbles(128, 128)
+    region = Region("gravel", np.ones((128, 128), bool), measure=(np.array([[10.0, 20.0], [74.0, 20.0]]), 0.5))
+    settings = Settings(quality="draft", resolution=128, rectify="off")
+    assert extract_palette(pixels, [region], settings, quiet).materials[0].metres_per_tile == pytest.approx(1.0)
+
+
+def test_corners_and_measures_beside_the_masks_and_as_text(tmp_path):
+    cv2.imwrite(str(tmp_path / "floor.png"), np.full((40, 40), 255, np.uint8))
+    points = [[1, 2], [30, 2], [30, 20], [1, 20]]
+    content = {"floor": {"corners": points, "measure": {"points": points[:2], "metres": 0.3}}}
+    (tmp_path / "regions.json").write_text(json.dumps(content), encoding="utf-8")
+    (region,) = read_regions(tmp_path, (40, 40))
+    assert np.array_equal(region.corners, points) and region.measure[1] == 0.3
+    assert np.array_equal(parse_corners("floor:1,2 30,2 30,20 1,20")[1], points)
+    name, (ends, metres) = parse_measure("a:b:1,2 30,2=0.3")
+    assert (name, metres) == ("a:b", 0.3) and np.array_equal(ends, points[:2])
+    for text in ("floor:1,2 30,2 30,20", "1,2 3,4 5,6 7", "floor:a,b c,d e,f g,h"):
+        with pytest.raises(PaletteError, match="NAME:X,Y"):
+            parse_corners(text)
+    with pytest.raises(PaletteError, match="positive"):
+        parse_measure("floor:1,2 30,2=-1")
+    (tmp_path / "regions.json").write_text('{"roof": {"corners": 3}}', encoding="utf-8")
+    with pytest.raises(PaletteError, match="regions.json"):
+        read_regions(tmp_path, (40, 40))
+
+
+def test_the_focal_length_is_read_from_exif(tmp_path):
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(360, 240, 3, "uint8")
+    spec.attribute("Exif:FocalLengthIn35mmFilm", oiio.TypeDesc("uint16"), 50)
+    file = oiio.ImageOutput.create("photo.jpg")
+    assert file.open(str(tmp_path / "photo.jpg"), spec)
+    file.write_image(np.zeros((240, 360, 3), np.uint8))
+    file.close()
+    assert read_photo(tmp_path / "photo.jpg").focal == pytest.approx(50 / 36 * 360, rel=0.01)
