@@ -1,4 +1,9 @@
-"""Cook-Torrance GGX, the model that the maps mean and Principled BSDF renders."""
+"""Cook-Torrance GGX, the model that the maps mean and Principled BSDF renders.
+
+Against Cycles on spheres under a sun, at roughness 0.2 to 1 (`tests/blender/test_brdf_cycles.py`): a dielectric's light
+is within 3 %, a metal's within 1 % with Blender's single-scattering GGX. Blender's default, which adds light scattered several
+times between facets, makes rough metals brighter than here: by 8 % at roughness 0.6, by a quarter at 0.9.
+"""
 
 import math
 
@@ -12,7 +17,8 @@ def shade(albedo, normal, roughness, light, view, metallic=0.0):
     """Light reflected towards the viewer per unit of irradiance at normal incidence, times pi.
 
     albedo (..., 3) linear; normal, light, view (..., 3) unit vectors; roughness (...) perceptual, alpha = roughness^2;
-    metallic (...). Returns (..., 3): a white Lambertian surface facing the light gives 1.
+    metallic (...). Returns (..., 3): a white matt surface facing the light would give 1, here it gives 0.96, and the
+    rest is reflected. Light and viewer can be exchanged; differentiable in everything.
     Source: Walter et al. 2007 (GGX), Smith's separable masking, Schlick 1994 (Fresnel).
     """
     half = torch.nn.functional.normalize(light + view, dim=-1)
@@ -30,8 +36,49 @@ def shade(albedo, normal, roughness, light, view, metallic=0.0):
     f0 = F0 * (1 - metallic) + albedo * metallic
     fresnel = f0 + (1 - f0) * (1 - vh) ** 5
     specular = distribution * smith(nl) * smith(nv) * fresnel / (4 * nl * nv).clamp_min(1e-4)
-    diffuse = (1 - metallic) * albedo / math.pi
+    # what the surface reflects does not get in
+    diffuse = (1 - metallic) * (1 - fresnel) * albedo / math.pi
     return math.pi * nl * (diffuse + specular)
+
+
+def plane(height: int, width: int) -> torch.Tensor:
+    """Places (height, width, 3) of the pixels of a picture 1 wide around the origin, x to the right, y up, z = 0."""
+    x = (torch.arange(width) + 0.5) / width - 0.5
+    y = (0.5 - (torch.arange(height) + 0.5) / height) * height / width
+    return torch.stack([x.expand(height, width), y[:, None].expand(-1, width), torch.zeros(height, width)], -1)
+
+
+def towards(point: torch.Tensor, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit vectors (..., 3) from places to a point (..., 3), a lamp or the eye, and how its light falls off (..., 1).
+
+    The falloff is 1 at as far from the point as the origin is.
+    """
+    way = point - places
+    squared = way.square().sum(-1, keepdim=True)
+    return way / squared.sqrt(), point.square().sum(-1, keepdim=True) / squared
+
+
+def sky(count: int) -> torch.Tensor:
+    """Unit vectors (count, 3) spread evenly over the hemisphere above z = 0: an environment is a sum of such lights.
+
+    With intensity 2 / count each they are a sky of radiance 1. Source: Fibonacci lattice, Gonzalez 2010.
+    """
+    i = torch.arange(count) + 0.5
+    z, angle = 1 - i / count, i * (math.pi * (1 + 5**0.5))
+    flat = torch.sqrt(1 - z**2)
+    return torch.stack([flat * torch.cos(angle), flat * torch.sin(angle), z], -1)
+
+
+def render(albedo, normal, roughness, lights, intensity, view, metallic=0.0) -> torch.Tensor:
+    """Light (..., H, W, 3) from a material under several lights.
+
+    Maps as in `shade`, (..., H, W, 3) and (..., H, W); lights (L, ..., 3) unit vectors and intensity (L, ..., 3 or 1),
+    the rest of each broadcast against the maps: (L, 1, 1, 3) is L suns; for lamps take both from `towards`. view as a light.
+    """
+    return sum(
+        shade(albedo, normal, roughness, light, view, metallic) * strength
+        for light, strength in zip(lights, intensity, strict=True)
+    )
 
 
 def render_sphere(svbrdf, size: int = 256, tiles: float = 2.0) -> np.ndarray:
