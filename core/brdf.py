@@ -1,8 +1,8 @@
 """Cook-Torrance GGX, the model that the maps mean and Principled BSDF renders.
 
-Against Cycles on spheres under a sun, at roughness 0.2 to 1 (`tests/blender/test_brdf_cycles.py`): a dielectric's light
-is within 3 %, a metal's within 1 % with Blender's single-scattering GGX. Blender's default, which adds light scattered several
-times between facets, makes rough metals brighter than here: by 8 % at roughness 0.6, by a quarter at 0.9.
+Against Cycles on spheres under a sun, roughness 0.2 to 1 (`tests/blender/test_brdf_cycles.py`): the light of
+dielectrics and metals is within 3 % with Blender's single-scattering GGX. Blender's default adds the light scattered
+several times between facets, which makes rough metals brighter than here: a golden one by 12 % at roughness 0.6.
 """
 
 import math
@@ -73,7 +73,8 @@ def render(albedo, normal, roughness, lights, intensity, view, metallic=0.0) -> 
     """Light (..., H, W, 3) from a material under several lights.
 
     Maps as in `shade`, (..., H, W, 3) and (..., H, W); lights (L, ..., 3) unit vectors and intensity (L, ..., 3 or 1),
-    the rest of each broadcast against the maps: (L, 1, 1, 3) is L suns; for lamps take both from `towards`. view as a light.
+    the rest of each broadcast against the maps: (L, 1, 1, 3) is L suns; for lamps take both from `towards`. view is
+    shaped as one light.
     """
     return sum(
         shade(albedo, normal, roughness, light, view, metallic) * strength
