@@ -57,7 +57,7 @@ QUICK = REGIONS[:3]
 # Only what may be copied (public domain, CC0, bundled) is shown.
 SHOWN = ("skimage_gravel", "skimage_brick", "osm_grass", "ufoai_tex_nature_rock017", *REGIONS)
 
-OURS = tuple(patch.ROUNDS)
+OURS = tuple(patch.PRESETS)
 ENGINES = OURS + tuple(baselines.ENGINES)
 # The slow ones: (exemplars, seeds) at most. They run side by side after the others.
 LIMITS = {"gpnn-faiss": (99, 1), "gpnn-exact": (1, 1), "gatys": (2, 1)}

@@ -22,7 +22,7 @@ from .material import SVBRDF
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
 
 VERSION = 1  # of palette.json
-QUALITIES = tuple(engines.patch.ROUNDS)
+QUALITIES = tuple(engines.patch.PRESETS)
 RESOLUTION_RANGE = (64, 8192)
 PREVIEW = 256  # px
 

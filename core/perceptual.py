@@ -4,6 +4,7 @@ Source: Ghildyal and Liu 2022 (shift-tolerant LPIPS, the AlexNet variant), Zhang
 their licence: models/stlpips_alex.md. Pixels are perceptually encoded (sRGB), 0 to 1.
 """
 
+import math
 from functools import cache
 from pathlib import Path
 
@@ -76,3 +77,44 @@ def distance(first: np.ndarray, second: np.ndarray) -> float:
     """Shift-tolerant LPIPS of two pictures (H, W, 3) of one size: 0 for the same, about 0.5 for unrelated ones."""
     pairs = zip(features(first), features(second), strict=True)
     return float(sum((a - b).square().sum(0).mean() for a, b in pairs))
+
+
+class Crops:
+    """Crops of an exemplar that textures are compared with."""
+
+    SIDE = 64  # px
+    MOST = 24
+
+    def __init__(self, pixels: np.ndarray, mask: np.ndarray):
+        """pixels (h, w, 3), mask (h, w) bool, the region; where no crop fits into it, `found` is False."""
+        side = self.SIDE
+        total = np.pad(mask.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+        count = total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
+        corners = np.argwhere(count == side * side) if count.size else np.zeros((0, 2), int)
+        self.found = len(corners) > 0
+        if self.found:
+            some = corners[np.linspace(0, len(corners) - 1, self.MOST).round().astype(int)]
+            self._layers = _flat(_crops(pixels, some, side))
+
+    @torch.no_grad()
+    def distance(self, texture: np.ndarray) -> float:
+        """Mean over crops of a tileable texture (H, W, 3) of the distance to the nearest of the exemplar's crops."""
+        h, w = texture.shape[:2]
+        # a grid over the torus; its first crop lies across the corner
+        rows, columns = (np.arange(4) * n // 4 - self.SIDE // 2 for n in (h, w))
+        corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
+        own = _flat(_crops(texture, corners, self.SIDE))
+        return float(sum(torch.cdist(a, b).square() for a, b in zip(own, self._layers, strict=True)).min(1)[0].mean())
+
+
+def _crops(pixels: np.ndarray, corners: np.ndarray, side: int) -> torch.Tensor:
+    h, w = pixels.shape[:2]
+    local = np.arange(side)
+    crops = [pixels[np.ix_((y + local) % h, (x + local) % w)] for y, x in corners]
+    return torch.from_numpy(np.stack(crops).transpose(0, 3, 1, 2).astype(np.float32))
+
+
+@torch.no_grad()
+def _flat(images: torch.Tensor) -> list[torch.Tensor]:
+    """The scaled layers (N, everything), so that squared Euclidean distances add up to the metric."""
+    return [x.flatten(1) / math.sqrt(x[0, 0].numel()) for x in _scaled(layers(images))]

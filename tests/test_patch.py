@@ -1,6 +1,9 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
+import torch
 from material_palette.core.engines import patch
 from material_palette.core.errors import Cancelled, PaletteError
 from material_palette.core.torus import WRAP_GATE, wrap_ratio
@@ -12,7 +15,7 @@ def synthesise(pixels, mask=None, size=(192, 192), seed=0, quality="draft"):
     return patch.sample(patch.learn(pixels, mask, quiet), size, seed, quiet, quality)
 
 
-@pytest.mark.parametrize("quality", patch.ROUNDS)
+@pytest.mark.parametrize("quality", patch.PRESETS)
 def test_texture_tiles_where_the_exemplar_does_not(quality):
     # the noise is as it is, the ramp makes the exemplar's own border a step
     exemplar = np.clip(pebbles(120, 120) * 0.6 + np.linspace(0, 0.4, 120, dtype=np.float32)[:, None, None], 0, 1)
@@ -76,6 +79,40 @@ def test_the_texture_has_the_exemplars_colours_and_sharpness():
         return np.abs(cv2.Laplacian(x.mean(-1), cv2.CV_32F)).mean()
 
     assert 0.8 < sharpness(texture) / sharpness(exemplar) < 1.1
+
+
+def test_patches_are_matched_to_the_exemplars_on_the_torus():
+    exemplar = pebbles(96, 96)
+    level = patch.learn(exemplar, np.ones((96, 96), bool), quiet).levels[0]
+    dull = torch.from_numpy(pebbles(64, 80, seed=5) * 0.6 + 0.1)
+
+    def match(image):
+        with ThreadPoolExecutor(2) as pool:
+            return patch._match(level, image, 4, torch.Generator().manual_seed(0), pool, lambda fraction: None)
+
+    matched = match(dull)
+    for statistic in (torch.mean, torch.std):
+        wanted = statistic(level.pixels)
+        assert abs(statistic(matched) - wanted) < 0.2 * abs(statistic(dull) - wanted)
+    rolled = match(dull.roll((30, 40), (0, 1))).roll((-30, -40), (0, 1))
+    # the ranks are of patches drawn at random
+    assert (rolled - matched).abs().mean() < 0.01
+
+
+def test_enlarging_wraps():
+    image = torch.rand(6, 9, 3)
+    large = patch._enlarged(image, (18, 27))
+    assert torch.allclose(patch._enlarged(image.roll((2, 1), (0, 1)), (18, 27)), large.roll((6, 3), (0, 1)), atol=1e-6)
+    assert patch._enlarged(image, (13, 20)).shape == (13, 20, 3)
+
+
+def test_the_sample_most_alike_is_kept():
+    exemplar = pebbles(160, 160)
+    level = patch.learn(exemplar, np.ones((160, 160), bool), quiet).levels[0]
+    garbage = level.valid.nonzero()[:, 0][torch.randint(int(level.valid.sum()), (128, 128))]
+    verbatim = (torch.arange(128)[:, None] + 8) * 160 + torch.arange(128) + 8
+    assert patch._most_alike(level, [garbage, verbatim]) is verbatim
+    assert patch._most_alike(level, [verbatim, garbage]) is verbatim
 
 
 def test_the_whole_region_is_used():

@@ -34,3 +34,14 @@ def test_layers_are_differentiable_and_as_described():
 def test_a_picture_of_few_pixels_is_refused():
     with pytest.raises(ValueError, match="32 px at least"):
         perceptual.features(np.zeros((20, 64, 3), np.float32))
+
+
+def test_crops_tell_a_texture_of_the_exemplar_from_another():
+    exemplar = pebbles(128, 128)
+    crops = perceptual.Crops(exemplar, np.ones((128, 128), bool))
+    assert crops.found
+    other = cv2.GaussianBlur(exemplar, (0, 0), 3)
+    assert crops.distance(pebbles(96, 160, seed=3)) < 0.8 * crops.distance(other)
+    narrow = np.zeros((128, 128), bool)
+    narrow[:40] = True
+    assert not perceptual.Crops(exemplar, narrow).found

@@ -5,15 +5,19 @@ a sharp, seamless tile that keeps the structure of the region and uses all of it
 coordinate c(p) of an exemplar pixel. Per level, from coarse to fine, a few rounds of
 
     S(p)  = weighted mean over offsets d of E(c(p + d) - d)                        (vote)
+    S    <- S moved so that F_S is distributed as F_E                              (match)
     c(p) <- argmin over candidates q of |F_S(p) - F_E(q)|^2 + lambda o(q)          (search)
 
 F are the principal components of the patch around a pixel, o says how often a source is already used. Candidates are
-the continuations of the neighbours' sources (coherence) and random jumps of falling reach. All indices wrap, so the
-texture tiles by construction; c carries any channel of the exemplar along. Where the exemplar repeats with a period,
-the tile is a whole number of periods and a source that is out of phase costs more: courses stay straight and close.
+the continuations of the neighbours' sources (coherence) and random jumps of falling reach. The texture is E(c), its
+patches matched once more, at three scales. All indices wrap, so it tiles by construction; c carries any channel of the
+exemplar along. Of several samples down to half the resolution the one that looks most like the exemplar is finished.
+Where the exemplar repeats with a period, the tile is a whole number of periods and a source that is out of phase costs
+more: courses stay straight and close.
 
 Sources: Efros and Freeman 2001 (quilting), Kwatra et al. 2005 (texture optimisation), Lefebvre and Hoppe 2005
-(coordinates, coherence, PCA), Barnes et al. 2009 (PatchMatch), Kaspar et al. 2015 (occurrence, guidance by periods).
+(coordinates, coherence, PCA), Barnes et al. 2009 (PatchMatch), Kaspar et al. 2015 (occurrence, guidance by periods),
+Pitie et al. 2005 (distributions matched by rotations), Elnekave and Weiss 2022 (patch distributions over scales).
 """
 
 import math
@@ -28,6 +32,7 @@ import torch
 import torch.nn.functional as F
 
 from ..errors import PaletteError
+from ..perceptual import Crops
 from .lattice import find_periods
 
 Progress = Callable[[float, str], None]
@@ -47,8 +52,23 @@ OCCURRENCE = 3.0  # lambda, in median patch distances
 COHERENCE = 0.6  # a random source must cost less than this share of one that continues a neighbour
 REACHES = (64, 8, 1)  # px of the random jumps
 BAND = 1 << 16  # pixels searched at a time by a thread
+RANKED = 1 << 16  # patches at most that decide a distribution
+QUANTILES = 1024
+MATCHED = 3  # scales at which the finished texture's patches are matched
+CHOSEN = 1  # level at which one of several samples is kept
 
-ROUNDS = {"draft": (2, 1), "balanced": (6, 2), "best": (10, 4)}  # per coarse level, at the finest level
+
+@dataclass(frozen=True)
+class Preset:
+    """rounds per coarse level and at the finest; samples to choose from; times the finished texture is matched."""
+
+    coarse: int
+    finest: int
+    samples: int
+    matches: int
+
+
+PRESETS = {"draft": Preset(2, 1, 1, 1), "balanced": Preset(4, 1, 1, 2), "best": Preset(6, 2, 3, 4)}
 
 
 @dataclass
@@ -148,10 +168,10 @@ def sample(
 ) -> Texture:
     """A tileable texture of size (H, W) px, at the exemplar's scale.
 
-    quality is a key of ROUNDS. The same concept, size, quality and seed give the same texture, bit for bit,
+    quality is a key of PRESETS. The same concept, size, quality and seed give the same texture, bit for bit,
     on any number of cores.
     """
-    coarse_rounds, finest_rounds = ROUNDS[quality]
+    preset = PRESETS[quality]
     generator = torch.Generator().manual_seed(seed)
     stretch, counts = _whole_periods(concept.periods, size)
     levels = concept.levels if stretch == (1.0, 1.0) else _stretched(concept, stretch)
@@ -159,36 +179,85 @@ def sample(
     while len(sizes) < len(levels) and min(sizes[-1]) >= 8 * PATCH:
         sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
     levels = levels[: len(sizes)]
-    rounds = [coarse_rounds if i else finest_rounds for i in range(len(sizes))]
-    work = [h * w * n for (h, w), n in zip(sizes, rounds, strict=True)]
     phases = [_Phases(counts, level, size) for level, size in zip(levels, sizes, strict=True)]
-    done = 0.0
+    coarsest = len(levels) - 1
+    chosen = min(CHOSEN, coarsest)
+    rounds = [preset.coarse if i else preset.finest for i in range(len(levels))]
+    work = [h * w * n for (h, w), n in zip(sizes, rounds, strict=True)]
+    total = sum(work[:chosen]) + preset.samples * sum(work[chosen:])
+    done = share = 0.0
 
     def report(fraction: float) -> None:
-        progress(min(1.0, (done + fraction * share) / sum(work)), "sampling the texture")
+        progress(min(1.0, 0.9 * (done + fraction * share) / total), "sampling the texture")
 
-    share = 0
-    coordinates = _quilt(levels[-1], sizes[-1], phases[-1], generator, report)
-    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        for i in reversed(range(len(levels))):
+    def refine(coordinates: torch.Tensor | None, first: int, last: int) -> torch.Tensor:
+        """Coordinates at level `last` of those at level first + 1; of a new quilt where there are none."""
+        nonlocal done, share
+        share = 0.0
+        if coordinates is None:
+            coordinates = _quilt(levels[first], sizes[first], phases[first], generator, report)
+        for i in range(first, last - 1, -1):
             level = levels[i]
-            if i < len(levels) - 1:
+            if i < coarsest:
                 coordinates = _upsample(level, levels[i + 1], coordinates, sizes[i])
             share = work[i] / rounds[i]
             for _ in range(rounds[i]):
                 image = _vote(level, coordinates, pool, lambda fraction: report(0.2 * fraction))
+                if i:
+                    image = _match(level, image, 1, generator, pool, lambda fraction: report(0.2))
                 jumps = int(torch.randint(2**31, (1,), generator=generator))
                 coordinates = _search(
                     level, image, coordinates, phases[i], jumps, pool, lambda fraction: report(0.2 + 0.8 * fraction)
                 )
                 done += share
-        share = 0
-        image = _vote(levels[0], coordinates, pool, report)
+        return coordinates
+
+    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        samples = [refine(None, coarsest, chosen) for _ in range(preset.samples)]
+        coordinates = refine(_most_alike(levels[chosen], samples), chosen - 1, 0)
+        image = levels[0].pixels[coordinates]
+        scales = min(MATCHED, len(levels))
+        for i in reversed(range(scales)):
+            start = 0.9 + 0.1 * (scales - 1 - i) / scales
+
+            def finish(fraction: float, start=start) -> None:
+                progress(start + 0.1 * fraction / scales, "matching the texture's patches")
+
+            small = image if i == 0 else _resized(image, sizes[i])
+            moved = _match(levels[i], small, preset.matches, generator, pool, finish)
+            image = moved if i == 0 else image.add_(_enlarged(moved.sub_(small), size))
+        image.clamp_(0, 1)
     columns = levels[0].shape[1]
     coordinates = torch.stack([coordinates // columns / stretch[0], coordinates % columns / stretch[1]], -1).long()
     coordinates = coordinates.clamp_max(torch.tensor(concept.mask.shape) - 1)
     shift = _calmest(image)
     return Texture(image.roll(shift, (0, 1)).numpy(), coordinates.roll(shift, (0, 1)).numpy())
+
+
+def _most_alike(level: Level, samples: list[torch.Tensor]) -> torch.Tensor:
+    """The sample that looks most like the exemplar; the first one where the region holds no crop to compare with."""
+    if len(samples) == 1:
+        return samples[0]
+    crops = Crops(level.pixels.reshape(*level.shape, 3).numpy(), level.inside.reshape(level.shape).numpy())
+    if not crops.found:
+        return samples[0]
+    return min(samples, key=lambda coordinates: crops.distance(level.pixels[coordinates].numpy()))
+
+
+def _resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """The means of the image (H, W, 3) over a coarser grid."""
+    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+
+
+def _enlarged(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Bilinear on the torus."""
+    for axis in (0, 1):
+        n = image.shape[axis]
+        at = (torch.arange(size[axis]) + 0.5) * (n / size[axis]) - 0.5
+        below = at.floor().long()
+        part = (at - below)[:, None, None] if axis == 0 else (at - below)[:, None]
+        image = torch.lerp(image.index_select(axis, below % n), image.index_select(axis, (below + 1) % n), part)
+    return image
 
 
 def _calmest(image: torch.Tensor) -> tuple[int, int]:
@@ -355,6 +424,64 @@ def _vote(level: Level, coordinates: torch.Tensor, pool: ThreadPoolExecutor, rep
 
     _each_band((h, w), vote, pool, report)
     return image.reshape(h, w, 3)
+
+
+def _match(level: Level, image: torch.Tensor, times: int, generator: torch.Generator, pool, report) -> torch.Tensor:
+    """The image (H, W, 3) with its patches moved so that they are distributed as the exemplar's.
+
+    Each time the patches' components are turned by a random rotation, along each axis every value goes to the
+    exemplar's value of the same rank, and the moves of all patches that hold a pixel are averaged.
+    """
+    h, w = image.shape[:2]
+    average = 1 / _window().square().sum()
+    features = level.features[level.valid]
+    features = features[:: -(-len(features) // RANKED)].T
+    for done in range(times):
+        turn, _ = torch.linalg.qr(torch.randn(COMPONENTS, COMPONENTS, generator=generator))
+        basis = (turn @ level.basis.flatten(1)).reshape(level.basis.shape)
+        low, step, moves = _moves(_quantiles(_some_components(image, basis, generator)), _quantiles(turn @ features))
+        moved = torch.empty_like(image)
+
+        def move(number, top, end, image=image, basis=basis, low=low, step=step, moves=moves, moved=moved) -> None:
+            wide = _with_halo(image, top, end, 2 * RADIUS).permute(2, 0, 1)[None]
+            wide = F.pad(wide, (2 * RADIUS, 2 * RADIUS, 0, 0), mode="circular")
+            values = F.conv2d(wide, basis)[0]
+            bins = ((values - low) / step).clamp_(0, QUANTILES - 1).long()
+            by = moves.gather(1, bins.flatten(1)).reshape(1, *values.shape)
+            by = F.conv_transpose2d(by, basis, padding=2 * RADIUS)[0].permute(1, 2, 0)
+            moved[top:end] = image[top:end] + average * by
+
+        _each_band((h, w), move, pool, lambda fraction, done=done: report((done + fraction) / times))
+        image = moved
+    return image
+
+
+def _some_components(image: torch.Tensor, basis: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """(COMPONENTS, n) of all patches of the image, of RANKED / 2 drawn ones where there are more than RANKED."""
+    h, w = image.shape[:2]
+    if h * w <= RANKED:
+        wide = F.pad(image.permute(2, 0, 1)[None], (RADIUS,) * 4, mode="circular")
+        return F.conv2d(wide, basis)[0].flatten(1)
+    place = torch.randint(h * w, (RANKED // 2,), generator=generator)
+    local = torch.arange(PATCH) - RADIUS
+    rows = (place // w)[:, None, None] + local[:, None]
+    columns = (place % w)[:, None, None] + local
+    patches = image.reshape(-1, 3)[(rows % h * w + columns % w).flatten(1)]
+    return basis.permute(0, 2, 3, 1).flatten(1) @ patches.flatten(1).T
+
+
+def _quantiles(values: torch.Tensor) -> np.ndarray:
+    values = np.sort(values.numpy(), 1)
+    return values[:, np.linspace(0, values.shape[1] - 1, QUANTILES).round().astype(int)]
+
+
+def _moves(before: np.ndarray, after: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """How far values go from one set of quantiles to the other, in equal bins from `low` in steps of `step`."""
+    low, high = before[:, :1], before[:, -1:]
+    step = np.maximum(high - low, 1e-6) / QUANTILES
+    at = low + (np.arange(QUANTILES) + 0.5) * step
+    moves = np.stack([np.interp(x, b, a) - x for x, b, a in zip(at, before, after, strict=True)])
+    return *(torch.from_numpy(x[..., None]) for x in (low, step)), torch.from_numpy(moves.astype(np.float32))
 
 
 def _search(level: Level, image, before, phases: _Phases, seed: int, pool: ThreadPoolExecutor, report) -> torch.Tensor:
