@@ -61,10 +61,38 @@ def test_a_texture_is_not_uniform(contrast):
     assert cut_exemplar(pixels, full(pixels)).uniform is None
 
 
-def test_over_exposure_is_said():
-    pixels = linear_from_srgb(pebbles(100, 100))
+def test_over_exposed_pixels_are_left_out_and_said():
+    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(100, 100))
     pixels[:20] = 1.0
-    assert any("over-exposed" in warning for warning in cut_exemplar(pixels, full(pixels)).warnings)
+    exemplar = cut_exemplar(pixels, full(pixels))
+    assert not exemplar.mask[:20].any() and exemplar.mask[22:].all()
+    assert any("20% of the region is over-exposed and left out" in warning for warning in exemplar.warnings)
+    assert np.allclose(exemplar.uniform or 0, 0)
+
+
+def test_one_clipped_channel_is_over_exposed_and_a_bright_photo_in_floats_is_not():
+    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(100, 100))
+    pixels[:20, :, 0] = 1.0
+    assert not cut_exemplar(pixels, full(pixels)).mask[:20].any()
+    bright = 6 * linear_from_srgb(0.2 + 0.6 * pebbles(100, 100))
+    assert cut_exemplar(bright, full(bright)).mask.mean() > 0.98
+
+
+def test_a_black_area_is_left_out_and_a_black_joint_kept():
+    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(120, 120))
+    pixels[:30] = 0
+    pixels[60:64] = 0
+    exemplar = cut_exemplar(pixels, full(pixels))
+    assert not exemplar.mask[:29].any() and exemplar.mask[60:64].all()
+    assert any("under-exposed and left out" in warning for warning in exemplar.warnings)
+
+
+def test_a_region_that_is_over_exposed_almost_everywhere_is_kept_and_said():
+    pixels = np.ones((100, 100, 3), np.float32)
+    pixels[:8] = linear_from_srgb(0.2 + 0.6 * pebbles(8, 100))
+    exemplar = cut_exemplar(pixels, full(pixels))
+    assert exemplar.mask.all()
+    assert any("92% of the region is over-exposed; too little" in warning for warning in exemplar.warnings)
 
 
 def test_of_a_huge_region_the_fullest_part_is_cut_and_said():
