@@ -22,10 +22,19 @@ REQUIRED = (
     Missing("torch", "torch", "synthesises the textures"),
 )
 
+# for the engine of that name alone
+DIFFUSION = (
+    Missing("diffusers", "diffusers", "runs Stable Diffusion"),
+    Missing("transformers", "transformers", "encodes the prompts"),
+    Missing("peft", "peft", "learns a concept"),
+    Missing("accelerate", "accelerate", "loads the weights"),
+    Missing("safetensors", "safetensors", "reads the weights"),
+)
 
-def missing():
-    """Return the list of `Missing` that this interpreter can't find, in the order of `REQUIRED`."""
-    return [entry for entry in REQUIRED if not _found(entry.module)]
+
+def missing(entries=REQUIRED):
+    """Return the list of those `entries` that this interpreter can't find, in their order."""
+    return [entry for entry in entries if not _found(entry.module)]
 
 
 def install_command(entries, python=None):

@@ -1,5 +1,6 @@
 """Arithmetic of tileable maps: everything here wraps in both axes."""
 
+import cv2
 import numpy as np
 import torch
 
@@ -63,3 +64,37 @@ def normal_from_height(height: torch.Tensor) -> torch.Tensor:
     # rows count downwards, +Y points up
     normal = torch.stack([-dx, dy, torch.ones_like(dx)], -1)
     return normal / normal.norm(dim=-1, keepdim=True)
+
+
+def close_seam(pixels: torch.Tensor, reach: float = 8.0) -> torch.Tensor:
+    """Pixels (H, W, C) with the steps across the border made as large as the steps beside them.
+
+    Screened Poisson equation on the torus, solved by Fourier transform: the picture whose gradient is nearest to the
+    given one, but for the steps across the border, which become the mean of the two beside them; with a pull towards
+    the given values, so that the change falls by e every `reach` px (Perez et al. 2003, Bhat et al. 2008).
+    """
+    x = pixels.permute(2, 0, 1)
+    screen = reach**-2
+    v, u = frequencies(*x.shape[1:])
+    # forward differences on the torus, and the negative of their own divergence
+    steps = [x.roll(-1, axis) - x for axis in (1, 2)]
+    steps[0][:, -1] = (steps[0][:, -2] + steps[0][:, 0]) / 2
+    steps[1][:, :, -1] = (steps[1][:, :, -2] + steps[1][:, :, 0]) / 2
+    divergence = sum(step - step.roll(1, axis) for step, axis in zip(steps, (1, 2), strict=True))
+    power = (2 - 2 * torch.cos(u)) + (2 - 2 * torch.cos(v))
+    spectrum = torch.fft.rfft2(screen * x - divergence) / (screen + power)
+    return torch.fft.irfft2(spectrum, s=x.shape[1:]).permute(1, 2, 0)
+
+
+def resize(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Pixels (h, w, C) float32 at another size (H, W), wrapping: bicubic, after a blur where they get fewer."""
+    h, w = pixels.shape[:2]
+    if size == (h, w):
+        return pixels
+    shrink = max(h / size[0], w / size[1])
+    if shrink > 1:
+        blurred = blur(torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))), 0.5 * (shrink**2 - 1) ** 0.5)
+        pixels = np.ascontiguousarray(blurred.permute(1, 2, 0).numpy())
+    rows, columns = (((np.arange(n) + 0.5) * m / n - 0.5).astype(np.float32) for n, m in zip(size, (h, w), strict=True))
+    x, y = np.meshgrid(columns, rows)
+    return cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)

@@ -1,0 +1,193 @@
+"""Sampling on the torus: a texture that tiles from a model that knows nothing of tiling.
+
+The latents of a texture of k x k windows are one torus. Before every denoising step they are rolled by a random shift,
+so that the borders of the windows, where the UNet's padding shows, never lie twice at the same place:
+
+    x_t     <- roll(x_t, s)                        s uniform on the torus
+    e       <- fold(predict(unfold(x_t), t))       window by window
+    x_(t-1) <- step(roll(e, -s), t, x_t)           any scheduler
+
+Few steps leave few shifts. There, features are rolled instead: every convolution gets a shift of its own, so that its
+padding lies elsewhere; the UNet then sees the whole torus at once. Decoding goes patch by patch, with a margin of
+latents around each that wraps, blended over it by linear ramps.
+
+Sources: Lopes, Pizzati, de Charette 2024 (noise rolling, decoding); Vecchio 2024, StableMaterials (feature rolling);
+Ho and Salimans 2022 (guidance).
+"""
+
+import contextlib
+import inspect
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from .model import Model
+from .settings import DiffusionSettings
+
+Progress = Callable[[float, str], None]
+
+MARGIN = 1  # latents around a patch that is decoded
+TAIL = 0.005  # of the grey values at either end, left out when colours are matched
+
+
+def spans(length: int, window: int) -> list[tuple[int, int]]:
+    """(start, end) of as few equal parts of a circle as are no longer than the window."""
+    count = -(-length // window)
+    edges = [round(i * length / count) for i in range(count + 1)]
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def windows(shape: tuple[int, int], window: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Rows and columns of windows of one size that cover a torus, in reading order; they overlap where they must."""
+    h, w = shape
+    rows, columns = (
+        [(torch.arange(min(window, side)) + start) % side for start, _ in spans(side, window)] for side in (h, w)
+    )
+    return [(r, c) for r in rows for c in columns]
+
+
+@torch.no_grad()
+def sample_latents(
+    model: Model,
+    text: tuple,
+    nothing: tuple,
+    shape: tuple[int, int],
+    steps: int,
+    generator: torch.Generator,
+    settings: DiffusionSettings,
+    progress: Progress,
+) -> torch.Tensor:
+    """Latents (1, 4, *shape) of a texture on the CPU; text and nothing are what `Model.encode` gives.
+
+    shape is at least one window's, or less in multiples of `Model.step`. The same generator gives the same latents.
+    """
+    scheduler = model.scheduler(settings.scheduler)
+    scheduler.set_timesteps(steps)
+    takes_generator = "generator" in inspect.signature(scheduler.step).parameters
+    more = {"generator": generator} if takes_generator else {}
+    # the schedule and its noise stay on the CPU, where they are the same on every machine
+    x = torch.randn(1, model.unet.config.in_channels, *shape, generator=generator) * scheduler.init_noise_sigma
+    whole = settings.roll == "feature"
+    places = windows(shape, max(shape) if whole else model.window)
+    if whole and len(places) > 1:
+        places = [(torch.arange(shape[0]), torch.arange(shape[1]))]
+    times = scheduler.timesteps
+    for i, t in enumerate(times):
+        model.beat = lambda i=i: progress(i / len(times), f"denoising, step {i + 1} of {len(times)}")
+        model.beat()
+        rolling = settings.roll != "none" and i >= settings.roll_from * len(times)
+        shift = [0, 0]
+        if rolling and not whole:
+            shift = [int(torch.randint(side, (1,), generator=generator)) for side in shape]
+        scaled = scheduler.scale_model_input(x, t).roll(shift, (2, 3))
+        with _rolled_features(model.unet, generator) if rolling and whole else contextlib.nullcontext():
+            e = _predict_windows(model, scaled, t, text, nothing, places, settings)
+        e = e.roll([-s for s in shift], (2, 3))
+        x = scheduler.step(e, t, x, **more, return_dict=False)[0]
+    model.beat = lambda: None
+    return x.float()
+
+
+def _predict_windows(model: Model, x, t, text, nothing, places, settings: DiffusionSettings) -> torch.Tensor:
+    """The guided prediction for the whole torus, (1, 4, h, w), from windows; where they overlap, their mean."""
+    out, count = torch.zeros_like(x, dtype=torch.float32), torch.zeros(x.shape[2:])
+    distilled = model.unet.config.time_cond_proj_dim is not None
+    guided = settings.guidance > 1 and not distilled
+    t = t.to(model.device)
+    pairs = [None if a is None else (a, b) for a, b in zip(nothing, text, strict=True)]
+    for first in range(0, len(places), settings.batch):
+        some = places[first : first + settings.batch]
+        batch = torch.cat([x[:, :, r[:, None], c] for r, c in some]).to(model.device)
+        if guided:
+            both = [p and torch.cat([x.expand(len(batch), *x.shape[1:]) for x in p]) for p in pairs]
+            e0, e = model.predict(torch.cat([batch, batch]), t, both).chunk(2)
+            e = e0 + settings.guidance * (e - e0)
+        else:
+            e = model.predict(batch, t, text, settings.guidance)
+        for (r, c), part in zip(some, e.cpu(), strict=True):
+            out[0][:, r[:, None], c] += part
+            count[r[:, None], c] += 1
+    return out / count
+
+
+@contextlib.contextmanager
+def _rolled_features(unet, generator: torch.Generator):
+    """Every convolution of the UNet sees its input rolled by a shift of its own, and its output is rolled back."""
+    shifts, hooks = {}, []
+
+    def before(module, args):
+        x, stride = args[0], module.stride[0]
+        sides = (side // stride for side in x.shape[2:])
+        shift = shifts[module] = [int(torch.randint(side, (1,), generator=generator)) for side in sides]
+        return (x.roll([s * stride for s in shift], (2, 3)), *args[1:])
+
+    def after(module, args, out):
+        return out.roll([-s for s in shifts.pop(module)], (2, 3))
+
+    try:
+        for module in unet.modules():
+            if isinstance(module, torch.nn.Conv2d) and module.kernel_size[0] > 1:
+                hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+@torch.no_grad()
+def decode(model: Model, latents: torch.Tensor, progress: Progress, margin: int = MARGIN) -> np.ndarray:
+    """The pixels (H, W, 3) float32 in [0, 1], encoded, of latents (1, 4, h, w); wraps.
+
+    Patches of at most a window and a margin around them that wraps: memory beyond the picture does not grow with it.
+    Neighbours are blended by linear ramps over the margins, which lie over each other.
+    """
+    h, w = latents.shape[2:]
+    f = model.factor
+    config = model.vae.config
+    z = latents / config.scaling_factor + (getattr(config, "shift_factor", None) or 0)
+    rows, columns = spans(h, model.window), spans(w, model.window)
+    picture = torch.zeros(3, h * f, w * f)
+    done, count = 0, len(rows) * len(columns)
+    with model.at_work("vae"), torch.autocast(model.device.type, enabled=False):
+        for top, bottom in rows:
+            y, weight_y = _ramped(top, bottom, margin, f)
+            band = torch.zeros(3, len(y), w * f)
+            for left, right in columns:
+                model.beat = lambda: progress(done / count, "decoding the texture")
+                model.beat()
+                x, weight_x = _ramped(left, right, margin, f)
+                r, c = (torch.arange(a - margin, b + margin) for a, b in ((top, bottom), (left, right)))
+                patch = z[:, :, (r % h)[:, None], c % w].to(model.device)
+                patch = model.vae.decode(patch, return_dict=False)[0][0].float().cpu()
+                # columns of a patch as wide as the torus come twice: index_add_ adds both
+                band.index_add_(2, x % (w * f), patch * (weight_y[:, None] * weight_x))
+                done += 1
+            picture.index_add_(1, y % (h * f), band)
+    model.beat = lambda: None
+    return picture.add_(1).div_(2).clamp_(0, 1).permute(1, 2, 0).contiguous().numpy()
+
+
+def _ramped(start: int, end: int, margin: int, f: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lines of a patch with its margins, in pixels, and their weights; those of neighbours add up to 1."""
+    lines = torch.arange((start - margin) * f, (end + margin) * f)
+    overlap = 2 * margin * f
+    if not margin:
+        return lines, torch.ones(len(lines))
+    nearest = torch.minimum(lines - lines[0], lines[-1] - lines) + 0.5
+    return lines, (nearest / overlap).clamp_max(1)
+
+
+def match_colour(pixels: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """The texture (H, W, 3) with the mean and standard deviation (3,) per channel that `colour_of` found of a region."""
+    of_texture = colour_of(pixels.reshape(-1, 3))
+    scale = deviation / np.maximum(of_texture[1], 1e-4)
+    return np.clip((pixels - of_texture[0]) * scale + mean, 0, 1).astype(np.float32)
+
+
+def colour_of(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (3,) of pixels (n, 3) whose grey value is none of the most extreme."""
+    grey = pixels.mean(1)
+    low, high = np.quantile(grey, (TAIL, 1 - TAIL))
+    some = pixels[(grey >= low) & (grey <= high)].astype(np.float64)
+    return some.mean(0).astype(np.float32), some.std(0).astype(np.float32)
