@@ -7,7 +7,8 @@
     python3 dev.py package [--wheels | --wheels all]    the extension's zip, into dist/
 
 The first call makes an environment in .venv/ (Blender as a module, torch, OpenCV: requirements.txt); later ones
-reuse it until requirements.txt or the Python changes. pip's own settings (PIP_INDEX_URL, PIP_EXTRA_INDEX_URL,
+reuse it until requirements.txt or the Python changes. `test` and `--engine diffusion` add what
+requirements-diffusion.txt lists. pip's own settings (PIP_INDEX_URL, PIP_EXTRA_INDEX_URL,
 PIP_FIND_LINKS) are respected.
 """
 
@@ -171,6 +172,24 @@ def ensure_environment():
         with open(os.path.join(VENV, "ready.json"), "w") as file:
             json.dump(stamp(), file)
         print("Environment ready, {:.0f} s".format(time.time() - start), flush=True)
+
+
+def ensure_diffusion():
+    """Add the packages of the engine `diffusion` to .venv, once."""
+    wanted, done = os.path.join(ROOT, "requirements-diffusion.txt"), os.path.join(VENV, "diffusion.txt")
+    with open(wanted, encoding="utf-8") as file:
+        text = file.read()
+    with locked():
+        if os.path.exists(done):
+            with open(done, encoding="utf-8") as file:
+                if file.read() == text:
+                    return
+        print("Adding the packages of requirements-diffusion.txt (once)", flush=True)
+        code, lines = pip(["install", "--progress-bar", "off", "-r", wanted, "-c", REQUIREMENTS])
+        if code:
+            raise SetupError(pip_failure(lines))
+        with open(done, "w", encoding="utf-8") as file:
+            file.write(text)
 
 
 def remove_environment():
@@ -490,6 +509,8 @@ def main(argv):
             python[0] = shutil.which(python[0])
             return hand_over([*python, os.path.abspath(__file__), *argv])
         ensure_environment()
+        if argv[0] == "test" or "diffusion" in argv:
+            ensure_diffusion()
         return hand_over([venv_python(VENV), os.path.abspath(__file__), *argv])
     except SetupError as error:
         print("dev.py: {}".format(error), file=sys.stderr)

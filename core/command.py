@@ -3,6 +3,7 @@
 import argparse
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 
 from .dependencies import install_command, missing
@@ -59,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto")
     extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
-    extract.add_argument("--engine", default="patch", help="texture engine: patch")
+    extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
     extract.add_argument("--quality", default="balanced", help="draft, balanced or best (%(default)s)")
     extract.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
     extract.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
@@ -84,6 +85,21 @@ def _parser() -> argparse.ArgumentParser:
     extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
     extract.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
     extract.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
+    diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)")
+    diffusion.add_argument("--model", default="", help="folder in diffusers' format, .safetensors checkpoint or hub id")
+    diffusion.add_argument("--online", action="store_true", help="fetch the model from the hub if it is not here")
+    diffusion.add_argument("--concepts", default="", metavar="DIR", help="keep learnt concepts here, to use them again")
+    diffusion.add_argument("--device", default="", help="cuda, mps or cpu (the best there is)")
+    diffusion.add_argument("--precision", default="", help="fp32, fp16 or bf16 (by device)")
+    diffusion.add_argument("--tuning-steps", type=int, default=800, metavar="N", help="at most (%(default)s)")
+    diffusion.add_argument("--prompt", default="", help="with S* for the region (one of the paper's)")
+    diffusion.add_argument("--steps", type=int, metavar="N", help="denoising steps (by quality: 25, 50, 50)")
+    diffusion.add_argument("--guidance", type=float, default=7.5, metavar="W", help="%(default)s; 1 for none")
+    diffusion.add_argument("--scheduler", default="", metavar="NAME", help="a scheduler of diffusers (the model's own)")
+    diffusion.add_argument("--prediction", default="", help="epsilon or v_prediction (the model's own)")
+    diffusion.add_argument("--roll", default="noise", help="noise, feature (few steps) or none (%(default)s)")
+    diffusion.add_argument("--roll-from", type=float, default=0.0, metavar="F", help="fraction of the steps (0)")
+    diffusion.add_argument("--candidates", type=int, metavar="K", help="samples; the best is kept (1; at best: 4)")
     extract.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
     return parser
 
@@ -115,6 +131,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         rectify=arguments.rectify,
         flatten=not arguments.no_flatten,
         metres_per_tile=arguments.metres_per_tile,
+        diffusion=_diffusion(arguments) if arguments.engine == "diffusion" else None,
     )
     settings.check()
     corners = dict(parse_corners(text) for text in arguments.corners)
@@ -157,6 +174,13 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
     line.say(f"{len(regions) - len(failed)} of {len(regions)} materials written to {folder}")
     return SOME_FAILED if failed else DONE
+
+
+def _diffusion(arguments: argparse.Namespace):
+    from .engines.diffusion import DiffusionSettings
+
+    given = {field.name: getattr(arguments, field.name, None) for field in fields(DiffusionSettings)}
+    return DiffusionSettings(**{name: value for name, value in given.items() if value is not None})
 
 
 class _Line:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from . import brdf, decomposition, engines, rectification, reduction, sheet
+from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
 from .exemplar import cut_exemplar
 from .image import linear_from_srgb, srgb_from_linear, write_image
@@ -36,7 +37,7 @@ class Settings:
     resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object,
     where a region's measure does not tell; rectify: "auto" brings a slanted region to the front, by its corners or by
     the plane that is found, "quad" by its corners only, "off" never; flatten takes the slow change of illumination out
-    of a region before synthesis.
+    of a region before synthesis. diffusion: settings of the engine of that name.
     """
 
     engine: str = "patch"
@@ -46,6 +47,7 @@ class Settings:
     rectify: str = "auto"
     flatten: bool = True
     metres_per_tile: float = 1.0
+    diffusion: DiffusionSettings | None = None
 
     def check(self) -> None:
         """Raise PaletteError naming the first setting that cannot be honoured."""
@@ -62,6 +64,8 @@ class Settings:
             raise PaletteError(f"rectify '{self.rectify}' is unknown; choose one of: {', '.join(rectification.MODES)}")
         if not (0 < self.metres_per_tile < float("inf")):
             raise PaletteError(f"metres per tile is {self.metres_per_tile}; choose a positive length")
+        if self.engine == "diffusion":
+            (self.diffusion or DiffusionSettings()).check()
 
 
 @dataclass
@@ -120,6 +124,7 @@ def extract_palette(
     if not regions:
         raise PaletteError("there is no region; paint one or choose automatic segmentation")
     start = time.perf_counter()
+    engine = engines.open_engine(settings.engine, settings.diffusion)
     palette = Palette(pixels, photo_name, regions, settings, [])
     with _one_thread_each():
         view = None
@@ -130,7 +135,7 @@ def extract_palette(
         for i, region in enumerate(regions):
             share = _part(progress, i / len(regions), (i + 1) / len(regions), f"{region.name}: ")
             try:
-                material = extract_material(pixels, region, settings, share, view, focal)
+                material = extract_material(pixels, region, settings, share, view, focal, engine)
             except PaletteError as error:
                 material = Material(region.name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
             palette.materials.append(material)
@@ -163,15 +168,18 @@ def extract_material(
     progress: Progress,
     view: rectification.View | None = None,
     focal: float | None = None,
+    engine=None,
 ) -> Material:
     """Extract the material of one region of a photo (H, W, 3) float32 linear.
 
-    view is what `rectification.look` finds in the photo, None: it is looked at here; focal as `extract_palette` takes.
+    view is what `rectification.look` finds in the photo, None: it is looked at here; focal as `extract_palette` takes;
+    engine is one that is open already.
     Raises PaletteError for settings that cannot be honoured and for a region too small to hold a texture.
     """
     settings.check()
     check_region(region)
-    engine = engines.ENGINES[settings.engine]
+    engine = engine or engines.open_engine(settings.engine, settings.diffusion)
+    learnt = 0.03 + 0.83 * engine.LEARNING_SHARE
     material = Material(region.name, metres_per_tile=settings.metres_per_tile)
     seconds = material.seconds
 
@@ -193,10 +201,11 @@ def extract_material(
         svbrdf = decomposition.constant(exemplar.uniform)
     else:
         with _timed(seconds, "learn"):
-            concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.03, 0.06))
+            concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.03, learnt))
         with _timed(seconds, "sample"):
             size = settings.resolution, settings.resolution
-            texture = engine.sample(concept, size, settings.seed, _part(progress, 0.06, 0.86), settings.quality)
+            texture = engine.sample(concept, size, settings.seed, _part(progress, learnt, 0.86), settings.quality)
+            material.warnings += getattr(texture, "warnings", [])
             material.texture = sheet.thumbnail(np.tile(texture.pixels, (2, 2, 1)))
         with _timed(seconds, "decompose"):
             svbrdf = decomposition.decompose(linear_from_srgb(texture.pixels), _part(progress, 0.86, 0.96))

@@ -22,6 +22,7 @@ def clone(tmp_path, monkeypatch):
     `.made` lists the environments made, `.became` the commands that dev.py handed over to."""
     requirements = tmp_path / "requirements.txt"
     requirements.write_text("one==1\n")
+    (tmp_path / "requirements-diffusion.txt").write_text("two==2\n")
     clone = SimpleNamespace(root=tmp_path, requirements=requirements, venv=tmp_path / ".venv", made=[], became=[])
 
     def make_venv():
@@ -47,6 +48,20 @@ def test_environment_is_made_once_and_the_command_handed_over(clone):
     assert dev.main(["demo"]) == 0
     assert len(clone.made) == 1
     assert clone.became[0] == [dev.venv_python(str(clone.venv)), os.path.abspath(dev.__file__), "test", "-x"]
+
+
+def test_packages_of_the_engine_diffusion_are_added_when_they_are_wanted(clone, monkeypatch):
+    asked = []
+    monkeypatch.setattr(dev, "pip", lambda arguments: asked.append(" ".join(arguments)) or (0, []))
+
+    def added():
+        return sum("requirements-diffusion.txt" in arguments for arguments in asked)
+
+    dev.main(["demo"])
+    assert added() == 0
+    dev.main(["extract", "photo.jpg", "--engine", "diffusion"])
+    dev.main(["test"])
+    assert added() == 1 and len(clone.made) == 1
 
 
 @pytest.mark.parametrize("change", ["requirements", "python"])

@@ -4,9 +4,11 @@ import torch
 from material_palette.core.torus import (
     WRAP_GATE,
     blur,
+    close_seam,
     gradient,
     integrate,
     normal_from_height,
+    resize,
     wrap_ratio,
 )
 from textures import tileable_noise
@@ -56,3 +58,43 @@ def test_normals_are_unit_and_point_away_from_the_slope_with_y_up():
     assert normal[16, 0, 1] < -0.1
     assert normal[48, 0, 1] > 0.1
     assert normal[..., 0].abs().max() < 1e-4
+
+
+def test_closing_a_seam_solves_the_screened_poisson_equation():
+    """Of a ramp, whose two ends do not meet, the solution is known: away from the border u'' - f'' = (u - f) / reach^2,
+    so that what is added is a hyperbolic sine about the middle; it leaves a share of 1 / (2 reach) of the step."""
+    height, reach, jump = 256, 8.0, 0.2
+    ramp = jump * (np.arange(height) + 0.5) / height
+    pixels = torch.from_numpy(np.broadcast_to(ramp[:, None, None], (height, 16, 1)).copy())
+    closed = close_seam(pixels, reach)[:, 3, 0].numpy()
+    change = closed - ramp
+    rate = 2 * np.arcsinh(0.5 / reach)  # of the discrete equation
+    rows = np.arange(height) - (height - 1) / 2
+    shape = np.sinh(rate * rows)
+    assert np.allclose(change, change[0] / shape[0] * shape, atol=1e-6)
+    slope = jump / height
+    assert abs((closed[0] - closed[-1]) - slope) < 0.07 * jump
+
+
+def test_a_seam_made_by_hand_is_closed_and_the_rest_kept():
+    tile = np.stack([tileable_noise(160, 192, seed) for seed in (0, 1, 2)], -1) * 0.6 + 0.1
+    ramp = np.linspace(0, 0.3, 192, dtype=np.float32)[:, None]
+    assert wrap_ratio(tile) < WRAP_GATE
+    seamed = (tile + ramp + np.linspace(0.2, 0, 160, dtype=np.float32)[:, None, None]).astype(np.float32)
+    assert wrap_ratio(seamed) > 2 * WRAP_GATE
+    closed = close_seam(torch.from_numpy(seamed)).numpy()
+    assert wrap_ratio(closed) < WRAP_GATE
+    assert np.abs(closed - seamed)[48:-48, 48:-48].max() < 1 / 255
+    assert np.allclose(closed.mean((0, 1)), seamed.mean((0, 1)), atol=1e-4)
+
+
+def test_resizing_wraps_and_keeps_the_picture():
+    tile = np.stack([tileable_noise(96, 128, seed) for seed in (0, 1, 2)], -1)
+    assert resize(tile, (96, 128)) is tile
+    for size in ((100, 120), (48, 64), (200, 300)):
+        resized = resize(tile, size)
+        assert resized.shape == (*size, 3) and wrap_ratio(resized) < WRAP_GATE
+        assert np.allclose(resized.mean((0, 1)), tile.mean((0, 1)), atol=0.01)
+    # rolling by half the tile before is rolling by half after
+    there = resize(np.roll(tile, (48, 64), (0, 1)), (48, 64))
+    assert np.allclose(there, np.roll(resize(tile, (48, 64)), (24, 32), (0, 1)), atol=1e-4)

@@ -7,18 +7,17 @@ import torch
 from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
-WIDTH, WINDOW, FACTOR, LENGTH = 16, 16, 4, 24
+WIDTH, WINDOW, FACTOR, LENGTH = 16, 8, 4, 24
 SIDE = WINDOW * FACTOR  # px of one window
 
 
 def tokenizer() -> CLIPTokenizer:
     """Letters, two words and the marks: what CLIP's is, but for the size."""
     letters = [chr(c) for c in range(33, 127)]
-    vocabulary = letters + [c + "</w>" for c in letters] + ["in", "in</w>", "of</w>", "<|startoftext|>", "<|endoftext|>"]
+    words = ["in", "in</w>", "of</w>", "<|startoftext|>", "<|endoftext|>"]
+    vocabulary = letters + [c + "</w>" for c in letters] + words
     merges = [("i", "n"), ("i", "n</w>"), ("o", "f</w>")]
-    return CLIPTokenizer(
-        vocab={word: n for n, word in enumerate(vocabulary)}, merges=merges, model_max_length=LENGTH
-    )
+    return CLIPTokenizer(vocab={word: n for n, word in enumerate(vocabulary)}, merges=merges, model_max_length=LENGTH)
 
 
 def text_encoder(kind=CLIPTextModel):
@@ -79,6 +78,7 @@ def write_model(folder: Path, prediction: str = "epsilon", xl: bool = False, see
         beta_schedule="scaled_linear",
         clip_sample=False,
         set_alpha_to_one=False,
+        steps_offset=1,
         prediction_type=prediction,
     )
     parts = {"unet": unet(xl, **more), "vae": vae(), "text_encoder": text_encoder(), "tokenizer": tokenizer()}
@@ -91,3 +91,53 @@ def write_model(folder: Path, prediction: str = "epsilon", xl: bool = False, see
         index[name] = [library, type(part).__name__]
     (folder / "model_index.json").write_text(json.dumps(index))
     return folder
+
+
+def frame(model_unet: UNet2DConditionModel, mark: float = 0.05) -> None:
+    """Give a UNet, in place, weights that make it the perfect denoiser of a plain texture, but for its padding, which
+    leaves a mark at its left and another at its right border, as the padding of trained ones does.
+
+    Everything but the first and the last convolution and the way between them is zero. Pairs of channels hold x and -x:
+    normalising divides x by its deviation, so that the prediction is the noise; a constant of the last convolution's
+    neighbours cancels but where they are padding.
+    """
+    bias = 6.0
+    with torch.no_grad():
+        for parameter in model_unet.parameters():
+            parameter.zero_()
+        half = WIDTH // 4  # the channels of a normalised group: two of x, two of -x
+        shortcut = model_unet.up_blocks[-1].resnets[-1].conv_shortcut.weight
+        shortcut[range(WIDTH), range(shortcut.shape[1] - WIDTH, shortcut.shape[1]), 0, 0] = 1.0
+        model_unet.conv_norm_out.weight.fill_(1.0)
+        model_unet.conv_norm_out.bias.fill_(bias)
+        for k in range(4):
+            for i in range(half):
+                sign = 1.0 if i % 2 else -1.0
+                model_unet.conv_in.weight[half * k + i, k, 1, 1] = sign
+                out = model_unet.conv_out.weight[k, half * k + i]
+                out[1, 1] = sign / half
+                out[1, 0], out[1, 2] = mark, -mark
+
+
+def plain_decoder(model_vae: AutoencoderKL) -> None:
+    """Give a VAE, in place, a decoder that shows three of the latents as they are, enlarged and normalised."""
+    bias = 6.0
+    decoder = model_vae.decoder
+    with torch.no_grad():
+        for parameter in decoder.parameters():
+            parameter.zero_()
+        model_vae.post_quant_conv.weight.copy_(torch.eye(4)[:, :, None, None])
+        model_vae.post_quant_conv.bias.zero_()
+        for k in range(4):
+            decoder.conv_in.weight[2 * k, k, 1, 1], decoder.conv_in.weight[2 * k + 1, k, 1, 1] = 1.0, -1.0
+        for block in decoder.up_blocks:
+            for resnet in block.resnets:
+                if resnet.conv_shortcut is not None:
+                    resnet.conv_shortcut.weight[range(8), range(8), 0, 0] = 1.0
+            for upsampler in block.upsamplers or ():
+                channels = range(upsampler.conv.weight.shape[0])
+                upsampler.conv.weight[channels, channels, 1, 1] = 1.0
+        decoder.conv_norm_out.weight.fill_(1.0)
+        decoder.conv_norm_out.bias.fill_(bias)
+        for k in range(3):
+            decoder.conv_out.weight[k, 2 * k, 1, 1], decoder.conv_out.weight[k, 2 * k + 1, 1, 1] = 0.15, -0.15

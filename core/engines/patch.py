@@ -37,6 +37,8 @@ from .lattice import find_periods
 
 Progress = Callable[[float, str], None]
 
+LEARNING_SHARE = 0.05
+
 PATCH = 7
 RADIUS = PATCH // 2
 COMPONENTS = 24

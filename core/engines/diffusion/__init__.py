@@ -1,7 +1,7 @@
 """Engine `diffusion`: Stable Diffusion learns the region as a concept and samples a tileable texture of it.
 
-The method of Lopes, Pizzati, de Charette (CVPR 2024), whole: crops -> LoRA-DreamBooth (`tuning`) -> noise rolling on the
-torus of latents, decoding patch by patch (`sampling`) -> what border seam is left is closed, the region's colour is
+The method of Lopes, Pizzati, de Charette (CVPR 2024), whole: crops -> LoRA-DreamBooth (`tuning`) -> noise rolling on
+the torus of latents, decoding patch by patch (`sampling`) -> what border seam is left is closed, the region's colour is
 matched, and of several samples the one nearest to the crops is kept. Needs weights and packages of the user's
 (docs/diffusion.md); nothing of either is imported with this module.
 """
@@ -23,7 +23,7 @@ from ... import torus
 from ...errors import PaletteError
 from ...tensors import read_tensors, write_tensors
 from . import memory, sampling, tuning
-from .model import Model, load
+from .model import Model, load, locate, require_packages
 from .settings import DiffusionSettings
 
 __all__ = ["Concept", "DiffusionSettings", "Engine", "Texture", "load_concept", "save_concept"]
@@ -63,23 +63,30 @@ class Concept:
 
 @dataclass
 class Texture:
-    """pixels (H, W, 3) float32 encoded, 0 to 1; latents (1, 4, h, w) they come from; distance to the crops, or None."""
+    """pixels (H, W, 3) float32 encoded, 0 to 1; latents (1, 4, h, w) they come from; distance to the crops, or None;
+    warnings: the concept's."""
 
     pixels: np.ndarray
     latents: torch.Tensor
     prompt: str
     distance: float | None = None
+    warnings: list[str] = field(default_factory=list)
 
 
 class Engine:
     """The model in memory, for as many regions as there are; read when it is first needed.
 
-    distance(texture (H, W, 3), crops (n, c, c, 3)) -> float, both float32 encoded: which sample is kept.
+    Raises PaletteError for settings that cannot be honoured, missing packages and a model that is not there.
     """
 
-    def __init__(self, settings: DiffusionSettings, distance: Callable | None = None):
-        settings.check()
-        self.settings, self.distance = settings, distance
+    LEARNING_SHARE = 0.5  # 800 steps with gradients, or 50 of four windows with guidance
+
+    def __init__(self, settings: DiffusionSettings | None):
+        self.settings = settings or DiffusionSettings()
+        self.settings.check()
+        require_packages()
+        if not self.settings.online:
+            locate(self.settings, lambda fraction, message: None)
         self.threads = torch.get_num_threads()
         self._model: Model | None = None
 
@@ -147,12 +154,12 @@ class Engine:
 
                 prompt = settings.prompt or PROMPTS[int(torch.randint(len(PROMPTS), (1,), generator=generator))]
                 texture = self._sample_once(model, prompt, concept, shape, steps, generator, report)
-                if candidates > 1 and self.distance:
-                    crops = concept.crops.astype(np.float32) / 255
-                    texture.distance = self.distance(texture.pixels, crops)
-                if best is None or texture.distance is not None and texture.distance < best.distance:
+                if candidates > 1:
+                    texture.distance = sampling.distance(texture.pixels, concept.crops)
+                if best is None or texture.distance < best.distance:
                     best = texture
-        best.pixels = torus.resize(best.pixels, size)
+        best.pixels = torus.resize(best.pixels, size).clip(0, 1)
+        best.warnings = concept.warnings
         progress(1.0, "sampled")
         return best
 
@@ -239,4 +246,4 @@ def load_concept(folder: Path) -> Concept:
     except OSError as error:
         raise PaletteError(f"cannot read '{path}': {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise PaletteError(f"'{path}' is damaged ({error}); delete its folder, and the concept is learnt again") from error
+        raise PaletteError(f"'{path}' is damaged ({error}); delete its folder to learn the concept again") from error

@@ -8,6 +8,8 @@ import json
 import tempfile
 from pathlib import Path
 
+import torch
+
 from ...errors import PaletteError
 
 CLIP_CONTEXT = 77  # tokens
@@ -176,7 +178,8 @@ def load(path: Path, dtype) -> dict:
         options = {"config": folder, "local_files_only": True}
         for name, kind in (("unet", UNet2DConditionModel), ("vae", AutoencoderKL)):
             # the conversion empties the dictionary that it is given
-            parts[name] = kind.from_single_file(dict(weights), subfolder=name, torch_dtype=dtype, **options)
+            its = dtype if name == "unet" else torch.float32
+            parts[name] = kind.from_single_file(dict(weights), subfolder=name, torch_dtype=its, **options)
         for number, padding in enumerate(configurations["padding"]):
             name = "text_encoder" if number == 0 else "text_encoder_2"
             kind = CLIPTextModelWithProjection if name == "text_encoder_2" else CLIPTextModel

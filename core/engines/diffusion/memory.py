@@ -61,7 +61,7 @@ def fit(model: Model, settings: DiffusionSettings, side: int, tuning: bool = Fal
     need = alone if model.offload else whole
     if need > there:
         raise PaletteError(
-            f"the model needs about {need / GB:.1f} GB of memory to {'learn' if tuning else 'sample'} on {model.device}, "
+            f"{'learning' if tuning else 'sampling'} needs about {need / GB:.1f} GB of memory on {model.device}, "
             f"{there / GB:.1f} GB are free: {WAY_OUT}"
         )
     how = ", one part at a time" if model.offload else ""

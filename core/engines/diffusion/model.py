@@ -136,7 +136,8 @@ class Model:
             more["added_cond_kwargs"] = {"text_embeds": pooled, "time_ids": sizes.expand(len(latents), 6)}
         if self.unet.config.time_cond_proj_dim is not None:
             # distilled models take the guidance as an input (Luo et al. 2023)
-            more["timestep_cond"] = _sinusoids(((guidance or 1) - 1) * 1000, self.unet.config.time_cond_proj_dim).to(states)
+            size = self.unet.config.time_cond_proj_dim
+            more["timestep_cond"] = _sinusoids(((guidance or 1) - 1) * 1000, size).to(states)
         return self.unet(latents.to(self.dtype), t, encoder_hidden_states=states.to(self.dtype), **more).sample.float()
 
 
@@ -153,13 +154,7 @@ def load(settings: DiffusionSettings, progress: Progress) -> Model:
     Raises PaletteError when packages are missing, when the model is not there, is a pickle, is of another kind or is
     not whole, when it would have to be fetched without consent, and for a device that is not there.
     """
-    lacking = dependencies.missing(dependencies.DIFFUSION)
-    if lacking:
-        names = ", ".join(entry.package for entry in lacking)
-        raise PaletteError(
-            f"the engine 'diffusion' needs packages that are missing: {names}. Install them with: "
-            f"{dependencies.install_command(lacking)}"
-        )
+    require_packages()
     device = _device(settings.device)
     dtype = PRECISIONS[settings.precision] if settings.precision else _dtype(device)
     progress(0.0, "looking for the model")
@@ -167,8 +162,6 @@ def load(settings: DiffusionSettings, progress: Progress) -> Model:
     progress(0.1, "reading the model")
     with _quiet():
         parts = checkpoint.load(path, dtype) if path.is_file() else _read_folder(path, dtype)
-    # SDXL's VAE overflows in half precision, and patches are small: it stays in full
-    parts["vae"].to(torch.float32)
     for name in PARTS:
         if name in parts:
             parts[name].requires_grad_(False).eval()
@@ -188,6 +181,17 @@ def load(settings: DiffusionSettings, progress: Progress) -> Model:
             # a look at the clock in every block: a step can take longer than a user who cancels waits
             module.register_forward_pre_hook(lambda *_: model.beat())
     return model
+
+
+def require_packages() -> None:
+    """Raise PaletteError naming the packages that are missing and the command that installs them."""
+    lacking = dependencies.missing(dependencies.DIFFUSION)
+    if lacking:
+        names = ", ".join(entry.package for entry in lacking)
+        raise PaletteError(
+            f"the engine 'diffusion' needs packages that are missing: {names}. Install them with: "
+            f"{dependencies.install_command(lacking)}"
+        )
 
 
 def locate(settings: DiffusionSettings, progress: Progress) -> Path:
@@ -268,9 +272,11 @@ def _read_folder(folder: Path, dtype: torch.dtype) -> dict:
                 f"'{folder}' is no model of SD 1.x, 2.x or SDXL: its {name} is {kind or 'missing'}, not {allowed[0]}"
             )
         variant = _variant(folder / name)
+        # SDXL's VAE overflows in half precision, and patches are small: the VAE works in full
+        its = torch.float32 if name == "vae" else dtype
         with _whole(folder / name):
             parts[name] = getattr(diffusers if library == "diffusers" else transformers, kind).from_pretrained(
-                folder / name, torch_dtype=dtype, use_safetensors=True, variant=variant, local_files_only=True
+                folder / name, torch_dtype=its, use_safetensors=True, variant=variant, local_files_only=True
             )
         if name in ("text_encoder", "text_encoder_2"):
             tokens = name.replace("text_encoder", "tokenizer")
@@ -303,7 +309,8 @@ def _variant(folder: Path) -> str | None:
 def identity(path: Path) -> str:
     """Hash that changes with the model: of its files' names, sizes and first MB each."""
     digest = hashlib.sha256()
-    for file in [path] if path.is_file() else sorted(path.rglob("*.safetensors")):
+    files = (file for pattern in ("*.safetensors", "*.json") for file in sorted(path.glob(f"*/{pattern}")))
+    for file in [path] if path.is_file() else files:
         digest.update(f"{file.name} {file.stat().st_size} ".encode())
         with file.open("rb") as content:
             digest.update(content.read(1 << 20))

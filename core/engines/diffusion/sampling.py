@@ -22,12 +22,14 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from ... import perceptual
 from .model import Model
 from .settings import DiffusionSettings
 
 Progress = Callable[[float, str], None]
 
 MARGIN = 1  # latents around a patch that is decoded
+COMPARED = 8  # crops, to choose between samples
 TAIL = 0.005  # of the grey values at either end, left out when colours are matched
 
 
@@ -154,7 +156,7 @@ def decode(model: Model, latents: torch.Tensor, progress: Progress, margin: int 
             y, weight_y = _ramped(top, bottom, margin, f)
             band = torch.zeros(3, len(y), w * f)
             for left, right in columns:
-                model.beat = lambda: progress(done / count, "decoding the texture")
+                model.beat = lambda done=done: progress(done / count, "decoding the texture")
                 model.beat()
                 x, weight_x = _ramped(left, right, margin, f)
                 r, c = (torch.arange(a - margin, b + margin) for a, b in ((top, bottom), (left, right)))
@@ -178,8 +180,24 @@ def _ramped(start: int, end: int, margin: int, f: int) -> tuple[torch.Tensor, to
     return lines, (nearest / overlap).clamp_max(1)
 
 
+def distance(texture: np.ndarray, crops: np.ndarray) -> float:
+    """Shift-tolerant LPIPS between a texture (H, W, 3) float32 and crops (n, c, c, 3) uint8: the mean over a few places
+    of the texture and a few of the crops, at the size that the model sees the crops at."""
+    side = crops.shape[1]
+    h, w = texture.shape[:2]
+    places = [((i * h // 2 + np.arange(side)) % h, (j * w // 2 + np.arange(side)) % w) for i in (0, 1) for j in (0, 1)]
+    of_texture = [perceptual.features(texture[r[:, None], c]) for r, c in places]
+    total = 0.0
+    some = crops[:: -(-len(crops) // COMPARED)]
+    for crop in some:
+        of_crop = perceptual.features(crop.astype(np.float32) / 255)
+        for found in of_texture:
+            total += sum(float((a - b).square().sum(0).mean()) for a, b in zip(found, of_crop, strict=True))
+    return total / (len(some) * len(places))
+
+
 def match_colour(pixels: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """The texture (H, W, 3) with the mean and standard deviation (3,) per channel that `colour_of` found of a region."""
+    """The texture (H, W, 3) with the mean and deviation (3,) per channel that `colour_of` has found of a region."""
     of_texture = colour_of(pixels.reshape(-1, 3))
     scale = deviation / np.maximum(of_texture[1], 1e-4)
     return np.clip((pixels - of_texture[0]) * scale + mean, 0, 1).astype(np.float32)

@@ -17,10 +17,10 @@ class DiffusionSettings:
     scheduler or prediction means the one that fits the machine or belongs to the model.
 
     Learning: at most tuning_steps, fewer if early_stop finds the loss settled; on crops of crop_size px (None: 256, for
-    SDXL 512), with `token` for the region in every prompt. Sampling: steps and candidates (None: by quality) of `prompt`
-    (one of the paper's where empty; S* stands for the token), with classifier-free guidance. roll: what is rolled on
-    the torus against seams, from the fraction roll_from of the steps on. batch: windows denoised at once. offload: only
-    the part at work stays on the device (None: where memory is short).
+    SDXL 512), with `token` for the region in every prompt. Sampling: steps and candidates (None: by quality) of
+    `prompt` (one of the paper's where empty; S* stands for the token), with classifier-free guidance. roll: what is
+    rolled on the torus against seams, from the fraction roll_from of the steps on. batch: windows denoised at once.
+    offload: only the part at work stays on the device (None: where memory is short).
     """
 
     model: str = ""
@@ -47,8 +47,8 @@ class DiffusionSettings:
         """Raise PaletteError naming the first setting that cannot be honoured. Looks at no file."""
         if not self.model:
             raise PaletteError(
-                "the engine 'diffusion' needs a model: name a folder in diffusers' format, a .safetensors checkpoint or "
-                "a hub id (docs/diffusion.md says which)"
+                "the engine 'diffusion' needs a model: name a folder in diffusers' format, a .safetensors checkpoint "
+                "or a hub id (docs/diffusion.md says which)"
             )
         choices = (
             ("precision", self.precision, ("", *PRECISIONS)),

@@ -1,10 +1,11 @@
 """Concept tuning: the region's crops, and LoRA-DreamBooth on them.
 
 For every crop x with the prompt "an object with S* texture": z = encode(x), eps ~ N(0, I), t uniform,
-z_t = sqrt(abar_t) z + sqrt(1 - abar_t) eps, and the low-rank weights (and they alone) descend on |predict(z_t, t) - y|^2,
+z_t = sqrt(abar_t) z + sqrt(1 - abar_t) eps, and the low-rank weights (they alone) descend on |predict(z_t, t) - y|^2,
 y = eps, or v = sqrt(abar_t) eps - sqrt(1 - abar_t) z for models that predict it.
 
-Sources: Lopes, Pizzati, de Charette 2024 (crops, hyper-parameters), Ruiz et al. 2023 (DreamBooth), Hu et al. 2022 (LoRA).
+Sources: Lopes, Pizzati, de Charette 2024 (crops, hyper-parameters), Ruiz et al. 2023 (DreamBooth), Hu et al. 2022
+(LoRA).
 """
 
 import json
