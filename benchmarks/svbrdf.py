@@ -294,13 +294,22 @@ def named(name: str) -> Callable:
     return row
 
 
+def published(prior: Prior, weights: Path | None) -> Decompose:
+    """The network of the paper's authors, with their checkpoint."""
+    from material_palette.models import resnet101
+
+    if weights is None:
+        raise SystemExit("resnet101 needs the authors' checkpoint: --rows resnet101=model.ckpt")
+    return lambda texture: resnet101.decompose(texture, _quiet, weights)
+
+
 ROWS = {
     "constant prior": constant_prior,
     "nothing": nothing,
     "luminance-to-normal": luminance_to_normal,
     "analytic": analytic,
     "unet": named("unet"),
-    "resnet101": named("resnet101"),
+    "resnet101": published,
 }
 DEFAULT = tuple(name for name in ROWS if name != "resnet101")
 LABELS = {"nothing": "photo as albedo, flat"}
