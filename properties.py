@@ -206,6 +206,11 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
     )
     overwrite: BoolProperty(name="Overwrite", description="Replace what the output folder holds")
 
+    author: StringProperty(name="Author", description="Of the photo; written into the assets made of it")
+    licence: StringProperty(
+        name="Licence", description="Of the photo, such as CC0 or CC BY 4.0; written into the assets made of it"
+    )
+
     palette: CollectionProperty(type=MATERIAL_PALETTE_PG_extracted)
     active_material: IntProperty(name="Active Material", min=0, options={"SKIP_SAVE"}, update=_show_region_of_material)
     palette_view: EnumProperty(

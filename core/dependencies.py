@@ -37,6 +37,13 @@ def missing(entries=REQUIRED):
     return [entry for entry in entries if not _found(entry.module)]
 
 
+def engines():
+    """{engine as a person calls it: names of the packages it lacks}."""
+    lacking = [entry.module for entry in missing()]
+    finding = [module for module in lacking if module != "torch"]
+    return {"Patch (textures)": lacking, "Auto Segment and Pick Material (regions)": finding}
+
+
 def install_command(entries, python=None):
     """Return the one-line shell command that installs `entries` (list of Missing) for this interpreter.
 

@@ -92,12 +92,12 @@ def set_preview(material, preview):
     slot.icon_pixels_float.foreach_set(np.ascontiguousarray(icon).ravel())
 
 
-def mark_asset(material, description):
+def mark_asset(material, description, author="", licence=""):
     """Mark `material` as an asset of the catalogue "Material Palette"."""
     material.asset_mark()
     asset = material.asset_data
     asset.catalog_id = CATALOG_ID
-    asset.description = description
+    asset.description, asset.author, asset.license = description, author, licence
     for tag in ("Material Palette", "tileable", "PBR"):
         asset.tags.new(tag, skip_if_exists=True)
 
@@ -340,8 +340,15 @@ def write_blend(path, palette_json, folder, previews, *, pack):
         finally:
             for material in built:
                 remove_material(material)
-    catalogue = f"VERSION 1\n\n{CATALOG_ID}:{CATALOG_NAME}:{CATALOG_NAME}\n"
-    (path.parent / "blender_assets.cats.txt").write_text(catalogue, encoding="utf-8")
+    add_catalogue(path.parent)
+
+
+def add_catalogue(folder):
+    """Name the assets' catalogue in the folder's catalogue file; what it lists already stays."""
+    path = Path(folder) / "blender_assets.cats.txt"
+    text = path.read_text(encoding="utf-8") if path.is_file() else "VERSION 1\n\n"
+    if CATALOG_ID not in text:
+        path.write_text(f"{text.rstrip()}\n\n{CATALOG_ID}:{CATALOG_NAME}:{CATALOG_NAME}\n", encoding="utf-8")
 
 
 class _names_free:

@@ -8,17 +8,33 @@ from . import (
     draw_region,
     edit_region,
     examine,
+    export,
     extract,
     history,
     palette,
     photo,
     pick,
+    preferences,
     regions,
     segment,
     setup,
 )
 
-_MODULES = (setup, photo, regions, edit_region, draw_region, pick, background, segment, extract, palette, assign)
+_MODULES = (
+    setup,
+    photo,
+    regions,
+    edit_region,
+    draw_region,
+    pick,
+    background,
+    segment,
+    extract,
+    palette,
+    assign,
+    export,
+    preferences,
+)
 _HANDLERS = (
     ("load_pre", background.stop_before_load),
     ("load_post", examine.all_changed),

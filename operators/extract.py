@@ -87,7 +87,7 @@ class _Extracts(BackgroundOperator):
             return
         material = nodes.build_material(made.record, made.folder, pack=self.pack, preview=made.preview)
         try:
-            nodes.mark_asset(material, f"Extracted from {self.photo_name}")
+            nodes.mark_asset(material, f"Extracted from {self.photo_name}", settings.author, settings.licence)
         except BaseException:
             nodes.remove_material(material)
             raise

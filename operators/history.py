@@ -26,6 +26,22 @@ def expected(settings, regions):
     return pace.expected(_load(), settings.engine, settings.quality, settings.resolution, regions)
 
 
+def count():
+    """How many materials are remembered."""
+    return len(_load())
+
+
+def folder():
+    """Where they are remembered, or None."""
+    return _path().parent if _path() else None
+
+
+def clear():
+    """Forget all, for good."""
+    _load().clear()
+    pace.remember(_path(), [])
+
+
 def forget():
     global _history
     _history = None

@@ -127,12 +127,13 @@ class MATERIAL_PALETTE_OT_compare(_NeedsBefore, Operator):
 
         entry = active_entry(context.scene.material_palette)
         new, old = entry.material, entry.previous
-        description = new.asset_data.description if new.asset_data else None
+        asset = new.asset_data
+        told = (asset.description, asset.author, asset.license) if asset else None
         entry.previous = None
         _take_place(old, new)
         entry.material, entry.previous = old, new
-        if description is not None:
-            nodes.mark_asset(old, description)
+        if told is not None:
+            nodes.mark_asset(old, *told)
         return {"FINISHED"}
 
 

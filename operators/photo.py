@@ -36,6 +36,16 @@ def photo_reader(image):
     return lambda: (pixels, [])
 
 
+def take_photo(context, image):
+    """Make `image` the scene's photo."""
+    from .preferences import apply_defaults
+
+    settings = context.scene.material_palette
+    if settings.photo is None:
+        apply_defaults(context, settings)
+    settings.photo = image
+
+
 def _file_reader(path):
     def read():
         from ..core.image import read_photo
@@ -152,7 +162,7 @@ class MATERIAL_PALETTE_OT_open_photo(Operator):
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        context.scene.material_palette.photo = image
+        take_photo(context, image)
         space = context.space_data
         if space is not None and space.type == "IMAGE_EDITOR":
             space.image = image
@@ -177,7 +187,7 @@ class MATERIAL_PALETTE_OT_use_shown_image(Operator):
         return True
 
     def execute(self, context):
-        context.scene.material_palette.photo = context.space_data.image
+        take_photo(context, context.space_data.image)
         return {"FINISHED"}
 
 
@@ -208,7 +218,7 @@ class MATERIAL_PALETTE_OT_paste_photo(Operator):
             self.report({"ERROR"}, "There is no picture in the clipboard")
             return {"CANCELLED"}
         pasted.pack()
-        context.scene.material_palette.photo = pasted
+        take_photo(context, pasted)
         return {"FINISHED"}
 
 
@@ -240,7 +250,7 @@ class MATERIAL_PALETTE_OT_restore_defaults(Operator):
         return {"FINISHED"}
 
 
-_KEPT = {"name", "active_region", "active_material", "palette_view", "show_regions"}
+_KEPT = {"name", "active_region", "active_material", "palette_view", "show_regions", "author", "licence"}
 
 CLASSES = (
     MATERIAL_PALETTE_OT_open_photo,

@@ -12,6 +12,7 @@ from bpy.types import Operator
 from ..core.errors import PaletteError
 from .setup import missing_sentence
 
+_BRUSH = "Region Brush"
 _GOLDEN_RATIO = 0.618034  # hues this far apart stay distinct however many there are
 
 
@@ -147,20 +148,28 @@ def painted_region(settings, space):
 
 
 def _soft_brush(context):
-    """A soft round brush, where this Blender has one to be chosen."""
+    """Take a soft round brush; return whether there is a brush."""
     paint = context.scene.tool_settings.image_paint
-    try:  # brushes are assets from 4.3 on
-        bpy.ops.brush.asset_activate(
-            asset_library_type="ESSENTIALS",
-            relative_asset_identifier="brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Soft",
-        )
-    except (AttributeError, RuntimeError):
-        pass
-    if paint.brush is None:
-        try:
+    if bpy.app.version < (4, 3, 0):
+        if paint.brush is None:
             paint.brush = bpy.data.brushes.get("TexDraw") or bpy.data.brushes.new("TexDraw", mode="TEXTURE_PAINT")
-        except (AttributeError, RuntimeError):  # read-only where brushes are assets
-            pass
+        return True
+    # from 4.3 on brushes are assets: Blender's own, which some distributions leave out, else one in this file
+    if not _activate_brush("ESSENTIALS", "brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Soft", paint):
+        brush = bpy.data.brushes.get(_BRUSH) or bpy.data.brushes.new(_BRUSH, mode="TEXTURE_PAINT")
+        if brush.asset_data is None:
+            brush.asset_mark()
+        brush.size = 50
+        _activate_brush("LOCAL", f"Brush/{_BRUSH}", paint)
+    return paint.brush is not None
+
+
+def _activate_brush(library, identifier, paint):
+    try:
+        bpy.ops.brush.asset_activate(asset_library_type=library, relative_asset_identifier=identifier)
+    except RuntimeError:
+        pass
+    return paint.brush is not None
 
 
 def _paint_colours(context, erase):
@@ -242,7 +251,7 @@ class MATERIAL_PALETTE_OT_remove_all_regions(NeedsRegion, Operator):
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_paint_region(NeedsRegion, Operator):
+class MATERIAL_PALETTE_OT_paint_region(NeedsPhoto, Operator):
     """Paint the active region over the photo in the Image Editor. Ctrl does the opposite"""
 
     bl_idname = "material_palette.paint_region"
@@ -257,19 +266,22 @@ class MATERIAL_PALETTE_OT_paint_region(NeedsRegion, Operator):
 
     def execute(self, context):
         settings = context.scene.material_palette
-        region = settings.regions[settings.active_region]
-        if region.mask is None:
-            self.report({"ERROR"}, f"Region '{region.name}' has no mask image")
-            return {"CANCELLED"}
         area = image_editor(context)
         if area is None:
             self.report({"ERROR"}, "No Image Editor in this window to paint in: open one beside this editor")
+            return {"CANCELLED"}
+        if not settings.regions and bpy.ops.material_palette.add_region() != {"FINISHED"}:
+            return {"CANCELLED"}
+        region = settings.regions[min(settings.active_region, len(settings.regions) - 1)]
+        if region.mask is None:
+            self.report({"ERROR"}, f"Region '{region.name}' has no mask image")
             return {"CANCELLED"}
         space = area.spaces.active
         space.image = region.mask
         space.mode = "PAINT"
         with context.temp_override(area=area, region=next(r for r in area.regions if r.type == "WINDOW")):
-            _soft_brush(context)
+            if not _soft_brush(context):
+                self.report({"WARNING"}, "This Blender has no brush to paint with: choose one, or draw with the lasso")
         _paint_colours(context, self.erase)
         region.automatic = False
         area.tag_redraw()

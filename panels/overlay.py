@@ -76,7 +76,7 @@ def _draw():
     gpu.state.blend_set("ALPHA")
     for region in [*others, *([active] if active and (active.visible or painted) else [])]:
         if region.mask is not None and all(region.mask.size):
-            width, fill = (2.0, 0.3) if region == active else (1.0, 0.15)
+            width, fill = (2.0, 0.2) if region == active else (1.0, 0.07)
             values = {"tint": region.colour, "width": width, "fill": 0.15 if painted == region else fill}
             _draw_square("region", _REGION, view, mask=region.mask, **values)
     gpu.state.blend_set("NONE")

@@ -172,6 +172,8 @@ class OptionsPanel:
         if not settings.pack:
             column.prop(settings, "output_folder", text="Folder")
             column.prop(settings, "overwrite")
+        column.prop(settings, "author")
+        column.prop(settings, "licence")
         layout.operator("material_palette.restore_defaults", icon="LOOP_BACK")
 
 
@@ -215,6 +217,9 @@ class PalettePanel:
             row.operator("material_palette.discard_before", text="", icon="CHECKMARK")
         for warning in entry.warnings.splitlines():
             _draw_text(layout, context, warning, "INFO")
+        row = layout.row(align=True)
+        row.operator("material_palette.save_library", text="To Library", icon="ASSET_MANAGER")
+        row.operator("material_palette.export", text="Export", icon="EXPORT")
 
 
 class AdjustPanel:
@@ -249,7 +254,7 @@ def _draw_grid(layout, context, settings):
 
 def _forecast(seconds, regions):
     what = "1 region" if regions == 1 else f"{regions} regions"
-    return f"{what}: about {duration(seconds)}" if seconds else f"{what}; the first run tells how long it takes"
+    return f"{what}: about {duration(seconds)}" if seconds else f"{what}, time not known yet"
 
 
 def _draw_progress(layout, run):

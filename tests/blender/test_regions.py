@@ -163,7 +163,7 @@ def test_the_sidebar_shows_what_there_is(draw, settings, photo_and_masks, make_r
     photo, masks = photo_and_masks
     bpy.ops.material_palette.open_photo(filepath=str(photo))
     bpy.ops.material_palette.import_masks(directory=str(masks))
-    assert "2 regions; the first run tells how long it takes" in draw()
+    assert "2 regions, time not known yet" in draw()
     settings.regions[0].error = "Region 'left' is empty"
     assert "Region 'left' is empty" in draw()
     material = nodes.build_material(make_record(write_maps()), tmp_path, pack=True)

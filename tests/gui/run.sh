@@ -1,17 +1,17 @@
 #!/bin/bash
 # The extension in a real Blender window: the example photo, real clicks, what the data holds afterwards, screenshots.
 #
-#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [extract_palette|interrupt]
+#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [artist|interrupt|redraws]
 #
 # The story is a pair of files here: NAME.py runs in Blender, NAME.sh drives the window from outside.
-# extract_palette, the default, also writes OUT-start.png, OUT-running.png and OUT-palette.png.
+# artist, the default, also writes OUT-1-photo.png to OUT-9-assigned.png.
 # Exit code 0 when all went as expected. PALETTE_EXAMPLE: another folder with photo.jpg and masks/.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 if [ $# -lt 2 ]; then sed -n '2,8s/^# \{0,1\}//p' "$0" >&2; exit 2; fi
 : "${BLENDER_GUI:?the path of blender_gui.sh}"
 
-name=${3:-extract_palette}
+name=${3:-artist}
 example=${PALETTE_EXAMPLE:-$(cd "$here/../../examples/facade" && pwd)}
 mkdir -p "$(dirname "$2")"
 out=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")

@@ -1,0 +1,215 @@
+"""Export: the palette as files for other programs, or as a .blend in an asset library."""
+
+import os
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy.types import Operator
+
+from ..core.errors import PaletteError
+from .setup import missing_sentence
+
+
+class _ExportsPalette:
+    """Mixin: works on the palette's materials that are there."""
+
+    @classmethod
+    def poll(cls, context):
+        sentence = missing_sentence()
+        if not sentence and not any(entry.material for entry in context.scene.material_palette.palette):
+            sentence = "Extract a palette first"
+        if sentence:
+            cls.poll_message_set(sentence)
+        return not sentence
+
+    def materials(self, context):
+        settings = context.scene.material_palette
+        chosen = settings.palette[settings.active_material :][:1] if self.only_active else settings.palette
+        return list(dict.fromkeys(entry.material for entry in chosen if entry.material))
+
+
+class MATERIAL_PALETTE_OT_export(_ExportsPalette, Operator):
+    """Write the palette, adjustments and all, for other programs: MaterialX documents with their maps, and glTF's
+    texture sets"""
+
+    bl_idname = "material_palette.export"
+    bl_label = "Export Palette"
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    only_active: BoolProperty(name="Only the Active Material", description="Leave the others of the palette out")
+    materialx: BoolProperty(
+        name="MaterialX", default=True, description="A .mtlx document per material, with its maps beside it"
+    )
+    gltf: BoolProperty(
+        name="glTF Textures",
+        default=True,
+        description="Base colour, normal, and occlusion, roughness and metallic in the channels of one picture",
+    )
+
+    def invoke(self, context, event):
+        if self.directory:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context):
+        from ..core.region import file_name
+
+        folder = Path(bpy.path.abspath(self.directory))
+        materials = self.materials(context)
+        try:
+            if not folder.is_dir():
+                raise PaletteError(f"No such folder: {folder}")
+            for material in materials:
+                self._write(material, file_name(material.name), folder)
+        except (PaletteError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(materials)} materials written to {folder}")
+        return {"FINISHED"}
+
+    def _write(self, material, name, folder):
+        from ..core import export
+        from ..core.image import srgb_from_linear, write_image
+
+        maps, tile_size, rotation, relief = adjusted_maps(material)
+        folder = folder / name
+        folder.mkdir(exist_ok=True)
+        if self.gltf:
+            export.write_gltf_maps(folder, name, maps)
+        if self.materialx:
+            listed = dict(maps) | {"height_scale": relief}
+            for kind, value in maps.items():
+                if np.ndim(value) < 2:
+                    continue
+                encoded = {"basecolor": lambda v: np.clip(srgb_from_linear(v), 0, 1), "normal": lambda v: (v + 1) / 2}
+                listed[kind] = f"{name}_{kind}.png"
+                write_image(folder / listed[kind], encoded.get(kind, lambda v: v)(value), 16 if kind == "height" else 8)
+            export.write_materialx(folder / f"{name}.mtlx", name, listed, tile_size, rotation)
+
+
+def adjusted_maps(material):
+    """What a material of ours looks like: (maps, tile_size, rotation, relief in metres).
+
+    maps: "basecolor" (H, W, 3) linear or (3,), "normal" (H, W, 3) unit vectors or None, "roughness" (H, W) or float,
+    "metallic" float, "height" (H, W) in [0, 1] or None; adjustments are in them. Raises PaletteError for a material
+    that isn't ours.
+    """
+    from ..core.export import adjust_colour, adjust_normal
+    from ..core.image import linear_from_srgb
+    from ..core.nodes import Controls
+
+    controls = Controls(material)
+    if not controls:
+        raise PaletteError(f"'{material.name}' was not made by Material Palette, or its nodes were taken apart")
+    principled = controls.node("principled")
+
+    def picture(kind):
+        node = controls.node(kind)
+        return _read(node.image) if node and node.image else None
+
+    colour = picture("basecolor")
+    if colour is None:
+        colour = np.array(principled.inputs["Base Color"].default_value[:3], np.float32)
+    else:
+        colour = adjust_colour(linear_from_srgb(colour), controls.hue, controls.saturation, controls.brightness)
+    normal = picture("normal")
+    if normal is not None:
+        normal = adjust_normal(normal * 2 - 1, controls.strength, controls.rotation)
+    roughness = picture("roughness")
+    if roughness is None:
+        roughness = float(principled.inputs["Roughness"].default_value)
+    else:
+        roughness = np.clip(roughness[..., 0] + controls.roughness_offset, 0, 1)
+    height = material.get("height")
+    maps = {
+        "basecolor": colour,
+        "normal": normal,
+        "roughness": roughness,
+        "metallic": float(principled.inputs["Metallic"].default_value),
+        "height": _read(height)[..., 0] if height is not None else None,
+    }
+    tile_size = controls.tile_size
+    relief = material.get("height_scale", 0.0) * (tile_size or 1.0) * controls.strength
+    return maps, tile_size, controls.rotation, relief
+
+
+def _read(image):
+    """(H, W, 3) float32 as stored, top row first."""
+    width, height = image.size
+    if not (width and height):
+        raise PaletteError(f"Texture '{image.name}' has no pixels; is its file still there?")
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    return np.ascontiguousarray(pixels.reshape(height, width, 4)[::-1, :, :3])
+
+
+_items = []  # Blender needs the strings of a dynamic enum to live on
+
+
+def _libraries(_operator, context):
+    libraries = context.preferences.filepaths.asset_libraries
+    _items[:] = [(library.name, library.name, library.path) for library in libraries if library.path]
+    return _items or [("", "No asset library", "Add one in Preferences > File Paths")]
+
+
+class MATERIAL_PALETTE_OT_save_library(_ExportsPalette, Operator):
+    """Save the palette, textures and all, as a .blend in an asset library, to be used from other files"""
+
+    bl_idname = "material_palette.save_library"
+    bl_label = "Save to Asset Library"
+    bl_options = {"REGISTER"}
+
+    library: EnumProperty(name="Library", description="One of Preferences > File Paths", items=_libraries)
+    name: StringProperty(name="File", description="Name of the .blend; a number is added when it is taken")
+    only_active: BoolProperty(name="Only the Active Material", description="Leave the others of the palette out")
+
+    def invoke(self, context, event):
+        photo = context.scene.material_palette.photo
+        self.name = f"{os.path.splitext(photo.name)[0]} palette" if photo else "palette"
+        return context.window_manager.invoke_props_dialog(self)
+
+    def execute(self, context):
+        from ..core import nodes
+        from ..core.region import file_name
+
+        library = next((x for x in context.preferences.filepaths.asset_libraries if x.name == self.library), None)
+        folder = Path(bpy.path.abspath(library.path)) if library else None
+        if folder is None or not folder.is_dir():
+            where = (
+                "no asset library; add one in Preferences > File Paths" if library is None else f"no folder {folder}"
+            )
+            self.report({"ERROR"}, f"There is {where}")
+            return {"CANCELLED"}
+        name, number = file_name(self.name.strip() or "palette"), 1
+        path = folder / f"{name}.blend"
+        while path.exists():
+            number += 1
+            path = folder / f"{name} {number}.blend"
+        materials = self.materials(context)
+        packed = [image for m in materials for image in nodes.images_of(m) if not image.packed_file]
+        try:
+            for image in packed:
+                image.pack()
+            bpy.data.libraries.write(str(path), set(materials), path_remap="RELATIVE", fake_user=True, compress=True)
+            nodes.add_catalogue(folder)
+        except (RuntimeError, OSError) as error:
+            self.report({"ERROR"}, f"{path} can't be written: {error}")
+            return {"CANCELLED"}
+        finally:
+            for image in packed:
+                if image.packed_file:
+                    image.unpack(method="REMOVE")
+        try:
+            bpy.ops.asset.library_refresh()
+        except RuntimeError:  # no Asset Browser is open
+            pass
+        self.report({"INFO"}, f"{len(materials)} materials saved in {path}")
+        return {"FINISHED"}
+
+
+CLASSES = (MATERIAL_PALETTE_OT_export, MATERIAL_PALETTE_OT_save_library)

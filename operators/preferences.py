@@ -1,0 +1,84 @@
+"""Preferences of the extension: defaults of new scenes, what engines there are, where its folder is."""
+
+from bpy.props import EnumProperty, IntProperty, StringProperty
+from bpy.types import AddonPreferences, Operator
+
+from ..core import dependencies
+from ..properties import QUALITIES, RESOLUTION_RANGE
+from . import history
+from .setup import missing
+
+PACKAGE = __package__.rpartition(".")[0]
+
+
+def preferences(context):
+    """The extension's preferences, or None where it isn't enabled as an add-on."""
+    addon = context.preferences.addons.get(PACKAGE)
+    return addon.preferences if addon else None
+
+
+def apply_defaults(context, settings):
+    """Give a scene that gets its first photo the defaults of the preferences, where nothing else was chosen."""
+    chosen = preferences(context)
+    for name in ("quality", "resolution", "author", "licence"):
+        if chosen is not None and not settings.is_property_set(name):
+            setattr(settings, name, getattr(chosen, name))
+
+
+class MATERIAL_PALETTE_preferences(AddonPreferences):
+    bl_idname = PACKAGE
+
+    quality: EnumProperty(
+        name="Quality", description="Quality that new scenes begin with", items=QUALITIES, default="balanced"
+    )
+    resolution: IntProperty(
+        name="Resolution",
+        description="Resolution that new scenes begin with",
+        default=1024,
+        min=RESOLUTION_RANGE[0],
+        max=RESOLUTION_RANGE[1],
+        subtype="PIXEL",
+    )
+    author: StringProperty(name="Author", description="Written into the assets that are made")
+    licence: StringProperty(name="Licence", description="Written into the assets that are made, such as CC0")
+
+    def draw(self, context):
+        layout = self.layout
+        box = layout.box()
+        box.label(text="New scenes", icon="SCENE_DATA")
+        column = box.column()
+        column.use_property_split = True
+        for name in ("quality", "resolution", "author", "licence"):
+            column.prop(self, name)
+        box = layout.box()
+        box.label(text="Engines", icon="MATERIAL")
+        for name, lacking in dependencies.engines().items():
+            row = box.row()
+            row.label(text=name, icon="ERROR" if lacking else "CHECKMARK")
+            row.label(text=f"Missing: {', '.join(lacking)}" if lacking else "Ready")
+        if missing():
+            column = box.column(align=True)
+            for entry in missing():
+                column.label(text=f"{entry.module}: {entry.reason}", icon="DOT")
+            box.operator("material_palette.copy_install_command", icon="COPYDOWN")
+            box.label(text="Paste the command into a terminal, then start Blender again.")
+        box = layout.box()
+        box.label(text="This machine", icon="TIME")
+        row = box.row()
+        row.label(text=f"{history.count()} materials timed, in {history.folder() or 'memory'}")
+        row.operator("material_palette.forget_times", text="Forget")
+
+
+class MATERIAL_PALETTE_OT_forget_times(Operator):
+    """Forget how long extraction took; the next run tells anew, as after a change of the machine"""
+
+    bl_idname = "material_palette.forget_times"
+    bl_label = "Forget Times"
+    bl_options = {"INTERNAL"}
+
+    def execute(self, context):
+        history.clear()
+        return {"FINISHED"}
+
+
+CLASSES = (MATERIAL_PALETTE_preferences, MATERIAL_PALETTE_OT_forget_times)
