@@ -12,7 +12,6 @@ from bpy.types import Operator
 from ..core.errors import PaletteError
 from .setup import missing_sentence
 
-_BRUSH = "Region Brush"
 _GOLDEN_RATIO = 0.618034  # hues this far apart stay distinct however many there are
 
 
@@ -154,19 +153,11 @@ def _soft_brush(context):
         if paint.brush is None:
             paint.brush = bpy.data.brushes.get("TexDraw") or bpy.data.brushes.new("TexDraw", mode="TEXTURE_PAINT")
         return True
-    # from 4.3 on brushes are assets: Blender's own, which some distributions leave out, else one in this file
-    if not _activate_brush("ESSENTIALS", "brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Soft", paint):
-        brush = bpy.data.brushes.get(_BRUSH) or bpy.data.brushes.new(_BRUSH, mode="TEXTURE_PAINT")
-        if brush.asset_data is None:
-            brush.asset_mark()
-        brush.size = 50
-        _activate_brush("LOCAL", f"Brush/{_BRUSH}", paint)
-    return paint.brush is not None
-
-
-def _activate_brush(library, identifier, paint):
-    try:
-        bpy.ops.brush.asset_activate(asset_library_type=library, relative_asset_identifier=identifier)
+    try:  # from 4.3 on brushes are assets; some distributions leave them out
+        bpy.ops.brush.asset_activate(
+            asset_library_type="ESSENTIALS",
+            relative_asset_identifier="brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Soft",
+        )
     except RuntimeError:
         pass
     return paint.brush is not None
