@@ -146,7 +146,7 @@ class MATERIAL_PALETTE_OT_draw_region(OverPhoto, Operator):
         return f"{how[self.shape]}   Ctrl: take away   Esc or right button: done"
 
     def invoke(self, context, event):
-        self.points, self.drawing, self.place = [], False, (0, 0)
+        self.points, self.drawing, self.take_away, self.place = [], False, False, (0, 0)
         return super().invoke(context, event)
 
     def handle(self, context, event):
@@ -156,11 +156,11 @@ class MATERIAL_PALETTE_OT_draw_region(OverPhoto, Operator):
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             if not usable:
                 return None
-            self.points, self.drawing = [self.place], True
+            self.points, self.drawing, self.take_away = [self.place], True, event.ctrl
         elif event.type == "MOUSEMOVE" and self.drawing:
             self.points = [*self.points, self.place] if self.shape == "LASSO" else [self.points[0], self.place]
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE" and self.drawing:
-            return self._close(context, event.ctrl)
+            return self._close(context, event.ctrl or self.take_away)
         elif event.type == "LEFTMOUSE":
             return None
         return {"RUNNING_MODAL"}

@@ -1,6 +1,5 @@
 """Pick Material: click on a material in the photo, see the region that is made of it, drag for the tolerance."""
 
-import importlib.util
 import threading
 
 import bpy
@@ -69,13 +68,6 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
     extend: BoolProperty(
         name="Extend", description="Begin with the active region's material", options={"SKIP_SAVE", "HIDDEN"}
     )
-
-    @classmethod
-    def poll(cls, context):
-        if importlib.util.find_spec("..core.segmentation.pick", __package__) is None:
-            cls.poll_message_set("This build can't pick yet")
-            return False
-        return super().poll(context)
 
     hint = "Click a material, drag for tolerance   Shift: add a place   Ctrl: take one away   Esc or right button: done"
 

@@ -87,25 +87,30 @@ class RegionsPanel:
         column.operator("material_palette.remove_region", text="", icon="REMOVE")
         column.separator()
         column.menu("MATERIAL_PALETTE_MT_region", text="", icon="DOWNARROW_HLT")
-        region = settings.regions[settings.active_region] if settings.active_region < len(settings.regions) else None
-        if region is not None:
+        if painted_region(settings, context.space_data):
+            _draw_painting(layout, settings)
+        else:
+            _draw_tools(layout, settings)
+        # last, so that no button moves away from under the mouse when a problem is found
+        if settings.active_region < len(settings.regions):
+            region = settings.regions[settings.active_region]
             seen = examine.known(region)
             for problem in filter(None, (region.error, seen.warning if seen else "")):
                 _draw_text(layout, context, problem, "ERROR")
-        if painted_region(settings, context.space_data):
-            _draw_painting(layout, settings)
-            return
-        row = layout.row(align=True)
-        row.operator("material_palette.pick_region", text="Pick Material", icon="EYEDROPPER")
-        row.operator("material_palette.paint_region", text="Paint", icon="BRUSH_DATA")
-        row = layout.row(align=True)
-        for shape in ("LASSO", "POLYGON", "BOX"):
-            row.operator("material_palette.draw_region", text=shape.title()).shape = shape
-        row = layout.row(align=True)
-        row.operator("material_palette.segment", icon="MOD_EXPLODE")
-        count = row.row(align=True)
-        count.ui_units_x = 4.0
-        count.prop(settings, "auto_regions", text="")
+
+
+def _draw_tools(layout, settings):
+    row = layout.row(align=True)
+    row.operator("material_palette.pick_region", text="Pick Material", icon="EYEDROPPER")
+    row.operator("material_palette.paint_region", text="Paint", icon="BRUSH_DATA")
+    row = layout.row(align=True)
+    for shape in ("LASSO", "POLYGON", "BOX"):
+        row.operator("material_palette.draw_region", text=shape.title()).shape = shape
+    row = layout.row(align=True)
+    row.operator("material_palette.segment", icon="MOD_EXPLODE")
+    count = row.row(align=True)
+    count.ui_units_x = 4.0
+    count.prop(settings, "auto_regions", text="")
 
 
 def _draw_painting(layout, settings):

@@ -1,6 +1,7 @@
 """Edits of regions as the operators do them, and what the list says of a region."""
 
 import bpy
+import numpy as np
 import pytest
 from material_palette.core.errors import PaletteError
 
@@ -175,3 +176,21 @@ def test_the_sidebar_shows_what_there_is(draw, settings, photo_and_masks, make_r
         assert "Compare" not in said and "over-exposed" in said
     bpy.data.materials.remove(material)
     assert "Remove from Palette" in draw()
+
+
+def test_pick_selects_the_clicked_half(settings, regions):
+    """Of a photo whose halves differ in colour a click finds its own one; it is looked at once."""
+    from material_palette.operators import pick
+
+    image = bpy.data.images.new("halves", 160, 96)
+    pixels = np.random.default_rng(0).normal(0.4, 0.02, (96, 160, 4)).astype(np.float32)
+    pixels[:, 80:, 1:] *= 0.3
+    image.pixels.foreach_set(pixels.ravel())
+    for x in (40, 120):
+        mask = pick.select(image, [(x, 40, True)], 0.5)
+        inside = (np.arange(160) < 80) == (x < 80)
+        assert mask.shape == (96, 160)
+        assert mask[:, inside].mean() > 0.8 and mask[:, ~inside].mean() < 0.1
+    assert not pick.select(image, [(40, 40, True), (40, 80, False)], 0.5)[80, 40]
+    assert len(pick._features) == 1
+    pick.forget()

@@ -87,6 +87,10 @@ def share(region):
     return float((pixels.reshape(-1, 4)[:, 0] > 0).mean())
 
 
+def texture_names(material):
+    return sorted(node.image.name for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeTexImage")
+
+
 def photo_rectangle():
     """Left, top, right and bottom of the photo in pixels of the screen."""
     area = blender_gui.find_area("IMAGE_EDITOR")
@@ -123,6 +127,7 @@ def report():
         "active": settings.active_region,
         "shares": [share(region) for region in settings.regions],
         "palette": [entry.material.name for entry in settings.palette if entry.material],
+        "images": [", ".join(texture_names(entry.material)) for entry in settings.palette if entry.material],
         "seeds": [entry.seed for entry in settings.palette],
         "before": [entry.previous is not None for entry in settings.palette],
         "previews": all(entry.material.preview.is_image_custom for entry in settings.palette if entry.material),

@@ -1,4 +1,5 @@
-"""Runs inside Blender's window: a run while the user undoes, opens another file or disables the extension.
+"""Runs inside Blender's window: a run while the user undoes, renders, saves, opens another file, disables the extension
+or quits.
 
 Environment: PALETTE_PHOTO, PALETTE_MASKS, PALETTE_STATE (JSON, written at the end: "error" is null or a traceback).
 """
@@ -74,6 +75,23 @@ def story():
     assert_nothing_left()
 
     yield from begin()
+    scene = bpy.context.scene
+    scene.render.engine, scene.render.resolution_percentage = "BLENDER_WORKBENCH", 5
+    with in_view():
+        assert bpy.ops.render.render() == {"FINISHED"}
+        bpy.ops.wm.save_as_mainfile(filepath=STATE + ".blend")
+    assert run().running
+    yield from wait(lambda: not run().running, 300)
+    assert run().error == "" and len(scene.material_palette.palette) == 1
+    assert_nothing_left()
+
+    yield from begin()
+    bpy.ops.wm.open_mainfile(filepath=STATE + ".blend")
+    yield from pause(1)
+    assert not run().running and not bpy.context.scene.material_palette.palette
+    assert_nothing_left()
+
+    yield from begin()
     bpy.ops.wm.read_homefile(app_template="")
     yield
     assert not run().running
@@ -96,20 +114,27 @@ def story():
     yield from wait(lambda: not run().running, 300)
     assert len(bpy.context.scene.material_palette.palette) == 1
 
+    # at last the end of Blender itself; the clicks outside look at how it ended
+    yield from begin()
+    write(None)
+    yield from pause(1)
+    assert run().running
+    bpy.ops.wm.quit_blender()
+
 
 def play(scene=story()):  # noqa: B008, one story per run of the script
-    error = None
     try:
         next(scene)
         return 0.2
-    except StopIteration:
-        pass
     except Exception:
-        error = traceback.format_exc()
-    with open(STATE + ".part", "w", encoding="utf-8") as file:
-        json.dump({"error": error}, file)
-    os.replace(STATE + ".part", STATE)
+        write(traceback.format_exc())
     return None
+
+
+def write(error):
+    with open(STATE + ".part", "w", encoding="utf-8") as file:
+        json.dump({"error": error, "temporary": bpy.app.tempdir}, file)
+    os.replace(STATE + ".part", STATE)
 
 
 blender_gui.show_tab("VIEW_3D", "Palette")

@@ -12,3 +12,6 @@ python3 - "$PALETTE_STATE" <<'PY'
 import json, sys
 sys.exit(json.load(open(sys.argv[1]))["error"])
 PY
+# the story ends by quitting during a run
+for ((i = 0; i < 120; i++)); do alive || break; xdo mousemove $((x + w / 4 + i % 2 * 20)) $((y + h / 2)); sleep 0.5; done
+! alive

@@ -18,4 +18,9 @@ out=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")
 export PALETTE_PHOTO="$example/photo.jpg" PALETTE_MASKS="$example/masks" PALETTE_SHOT=$out PALETTE_STATE="$out.state.json"
 rm -f "$PALETTE_STATE"
 export BGUI_PASS="PALETTE_PHOTO PALETTE_MASKS PALETTE_STATE" BGUI_SHARE="$here:$example:$(dirname "$out")"
-GUI_DRIVE="$here/$name.sh" exec "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out"
+if [ "$name" != interrupt ]; then
+  GUI_DRIVE="$here/$name.sh" exec "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out"
+fi
+# this story ends with the end of Blender, which the driver reports with its exit code
+GUI_DRIVE="$here/$name.sh" "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out" 2>&1 | tee "$out.txt" || true
+grep -q "Blender ended before the screenshot, code 0" "$out.txt"
