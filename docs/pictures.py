@@ -1,8 +1,10 @@
 """Makes the README's pictures from the palettes of the two bundled examples: the sheet, and a render by Cycles.
 
     .venv/bin/python docs/pictures.py
+    .venv/bin/python docs/pictures.py WINDOW.png
 
-extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg. 3 minutes.
+The first extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg, in 3
+minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip WINDOW.png` has left beside it.
 """
 
 import sys
@@ -21,6 +23,7 @@ from material_palette.core.command import main  # noqa: E402
 
 SHEETS = {"viaduct": "demo", "facade": "facade"}
 SHOWN = [("viaduct", "masonry"), ("viaduct", "rubble"), ("facade", "stone_wall"), ("facade", "red_wood")]
+WINDOWS = {"4-picked": "window-regions", "7-palette": "window"}  # of tests/gui/artist.sh
 REPEATS = 1.0  # of the tile along a wall
 
 
@@ -91,6 +94,10 @@ def render(path: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        for picture, name in WINDOWS.items():
+            save(cv2.imread(f"{sys.argv[1].removesuffix('.png')}-{picture}.png"), DOCS / f"{name}.jpg", 1400)
+        raise SystemExit
     folders = {example: extract(example) for example in SHEETS}
     for example, name in SHEETS.items():
         save(cv2.imread(str(folders[example] / "palette.png")), DOCS / f"{name}.jpg", 1400)

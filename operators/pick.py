@@ -145,6 +145,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
             self.key = add_region(settings, "Picked", mask).key
         else:
             set_mask(region, mask)
+        self.area.tag_redraw()
         text = f"Tolerance {self.tolerance:.0%}, {mask.mean():.1%} of the photo"
         context.workspace.status_text_set(f"{text}   {self.hint}")
 

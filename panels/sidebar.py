@@ -209,17 +209,18 @@ class PalettePanel:
             row.operator("material_palette.delete_material", text="", icon="TRASH")
             row = layout.row(align=True)
             row.scale_y = 1.3
-            row.operator("material_palette.assign", icon="CHECKMARK")
-            row.operator("material_palette.assign", text="Assign and Map", icon="UV").mapping = "UNMAPPED"
-            row.operator("material_palette.replace_material", text="", icon="ARROW_LEFTRIGHT")
+            row.operator("material_palette.assign")
+            row.operator("material_palette.assign", text="Assign and Map").mapping = "UNMAPPED"
         else:
             _draw_text(layout, context, f"The material of '{entry.name}' was deleted", "ERROR")
             layout.operator("material_palette.delete_material", text="Remove from Palette", icon="TRASH")
         row = layout.row(align=True)
         row.operator("material_palette.vary", icon="FILE_REFRESH")
+        row.operator("material_palette.replace_material", text="Replace", icon="ARROW_LEFTRIGHT")
         if entry.previous is not None:
+            row = layout.row(align=True)
             row.operator("material_palette.compare", text="Compare", icon="UV_SYNC_SELECT")
-            row.operator("material_palette.discard_before", text="", icon="CHECKMARK")
+            row.operator("material_palette.discard_before", icon="CHECKMARK")
         for warning in entry.warnings.splitlines():
             _draw_text(layout, context, warning, "INFO")
         row = layout.row(align=True)

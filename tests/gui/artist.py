@@ -68,7 +68,13 @@ def keep_two():
     by_area = sorted(settings.regions, key=share)
     for region in settings.regions:
         region.enabled = region.name in {region.name for region in by_area[:2]}
+    settings.quality, settings.resolution = "balanced", 256
     bpy.ops.ed.undo_push(message="Choose")
+
+
+def hurry():
+    palette().quality, palette().resolution = "draft", 128
+    bpy.ops.ed.undo_push(message="Hurry")
 
 
 def save():

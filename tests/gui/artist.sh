@@ -23,7 +23,7 @@ PY
   echo "$((SECONDS - start)) s: $condition"
 }
 state() { python3 -c 'import json, sys; print(eval(sys.argv[2], json.load(open(sys.argv[1]))))' "$PALETTE_STATE" "$1"; }
-picture() { shot "${PALETTE_SHOT%.png}-$1.png"; }
+picture() { sleep 2; shot "${PALETTE_SHOT%.png}-$1.png"; }
 tell() { echo "$1" >"$PALETTE_STATE.do"; expect "done and done[-1] == '$1'" 30; sleep 1; }
 # press TEXT CONDITION SECONDS: click on a button of the sidebar; a second time where a busy machine has lost the click
 press() {
@@ -105,10 +105,11 @@ picture 5-segmented
 tell keep_two
 press "Extract Palette" running 20
 expect "running and len(palette) == 1" 300
-picture 6-running
+shot "${PALETTE_SHOT%.png}-6-running.png"
 key Escape
 expect "not running and len(palette) == 1 and not temporary and not error" 20
 
+tell hurry
 press "Extract Palette" running 20
 expect "not running and len(palette) == 2 and previews and not error and not temporary" 300
 picture 7-palette
