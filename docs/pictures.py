@@ -4,7 +4,7 @@
     .venv/bin/python docs/pictures.py WINDOW.png
 
 The first extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg, in 3
-minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip WINDOW.png` has left beside it.
+minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip WINDOW.png` has left.
 """
 
 import sys
