@@ -55,8 +55,9 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument(
         "--masks",
         type=Path,
-        metavar="DIR",
-        help="one mask image per material, named as the material; for several photos DIR/<photo's name>/",
+        metavar="DIR|FILE",
+        help="one mask image per material, named as the material; for several photos DIR/<photo's name>/. "
+        "Or one image of colours or indices, or COCO's JSON",
     )
     where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto")
     extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
@@ -113,11 +114,14 @@ def _jobs(arguments: argparse.Namespace) -> list[tuple[Path, Path | None, Path]]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice:
         raise PaletteError(f"two photos are named '{twice}' and would share an output folder; extract them separately")
-    return [(p, arguments.masks and arguments.masks / p.stem, arguments.output / p.stem) for p in photos]
+    masks = arguments.masks
+    one_file = masks is None or masks.is_file()  # COCO's JSON speaks of several photos
+    return [(p, masks if one_file else masks / p.stem, arguments.output / p.stem) for p in photos]
 
 
 def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argparse.Namespace) -> int:
     from . import nodes
+    from .annotations import read_annotations
     from .image import read_photo
     from .output import staged
     from .palette import Material, Settings, extract_palette, write_palette
@@ -145,7 +149,8 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         seconds = {"photo": time.perf_counter() - start}
         start = time.perf_counter()
         if masks is not None:
-            regions = read_regions(masks, photo.pixels.shape[:2])
+            shape = photo.pixels.shape[:2]
+            regions = read_annotations(masks, shape, photo_path.name) if masks.is_file() else read_regions(masks, shape)
         else:
             from .segmentation import segment
 

@@ -172,6 +172,34 @@ def read_mask(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
     return np.ascontiguousarray(_upright(painted, orientation))
 
 
+def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
+    """Read an image of codes, a colour or index per region, as (H, W, C) uint8 or uint16, resized to the nearest pixel.
+
+    What is transparent becomes 0. Raises PaletteError for a file that doesn't read as an image, is stored with loss or
+    as floats, or whose aspect ratio is more than 2 % off.
+    """
+    path = Path(path)
+    with _opened(path, "Mask") as image:
+        spec = image.spec()
+        height, width = shape
+        if image.format_name() in LOSSY_ZERO or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
+            raise PaletteError(f"Mask '{path}' doesn't keep colours exactly. Save it as PNG of 8 or 16 bits.")
+        if abs(spec.width * height / (spec.height * width) - 1) > ASPECT_TOLERANCE:
+            raise PaletteError(
+                f"Mask '{path}' is {spec.width} x {spec.height} px, of another shape than the photo "
+                f"({width} x {height} px). Paint it on the photo itself."
+            )
+        rows = ((np.arange(height) + 0.5) * spec.height / height).astype(int)
+        columns = ((np.arange(width) + 0.5) * spec.width / width).astype(int)
+        alpha = spec.alpha_channel
+        colour = [c for c in range(spec.nchannels) if c != alpha]
+        blocks = [block for _, block in _blocks(image, path, "Mask")]
+        codes = np.concatenate(blocks)[rows][:, columns]
+    if alpha >= 0:
+        codes[codes[..., alpha] == 0] = 0
+    return codes[..., colour]
+
+
 def write_image(path: str | Path, pixels: np.ndarray, bits: int = 8) -> None:
     """Write (H, W) or (H, W, 3) floats in [0, 1], already encoded, as a PNG of 8 or 16 bits per channel.
 
