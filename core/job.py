@@ -4,7 +4,10 @@ The thread gets two callbacks and touches nothing else of the caller; whoever ow
 own thread. Cancelling is cooperative: the next call of `progress` or `send` raises `Cancelled` inside the work.
 """
 
+import contextlib
+import os
 import queue
+import sys
 import threading
 import time
 
@@ -13,6 +16,14 @@ from .errors import Abandoned, Cancelled
 # A forecast from less than this is noise.
 _LEAST_SECONDS = 1.0
 _LEAST_FRACTION = 0.02
+_NICE = 5  # steps of priority that the work stands behind the window
+
+
+def _step_back():
+    """Let the window go first: on Linux a thread, with those that it starts, has a priority of its own."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0) + _NICE)
 
 
 class Job:
@@ -77,6 +88,7 @@ class Job:
         return elapsed * (1.0 - self.fraction) / self.fraction
 
     def _run(self):
+        _step_back()
         try:
             result = self._work(self._progress, self._send)
         except Cancelled:

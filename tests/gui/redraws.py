@@ -1,7 +1,8 @@
-"""Runs inside Blender's window: how often it redraws while idle, and while a palette is extracted.
+"""Runs inside Blender's window: how often it redraws, and how often it is free to, idle and while a palette is extracted.
 
-A draw handler counts; a timer asks for the next redraw as soon as Blender is free, as a user's mouse would. Written to
-PALETTE_STATE as JSON: redraws per second, longest gap in seconds, of both.
+Redraws: a draw handler counts, and a timer asks for the next redraw as soon as Blender is free, as a user's mouse would.
+Where graphics are software, that is how long drawing takes. Turns: the same timer without drawing, how often Blender
+comes round to what waits for it. Written to PALETTE_STATE as JSON: per second, and the longest gap in seconds.
 """
 
 import json
@@ -12,8 +13,9 @@ import blender_gui
 import bpy
 
 STATE = os.environ["PALETTE_STATE"]
-SECONDS = 15
+SECONDS = 10
 times = []
+drawing = True
 
 
 def area():
@@ -21,21 +23,31 @@ def area():
 
 
 def on_draw():
-    times.append(time.monotonic())
+    if drawing:
+        times.append(time.monotonic())
 
 
-def measured():
+def measured(seconds, draw):
+    """Let a generator's result be what was counted for so many seconds."""
+    global drawing
+    drawing = draw
+    times.clear()
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if draw:
+            area().tag_redraw()
+        else:
+            times.append(time.monotonic())
+        yield
     gaps = [b - a for a, b in zip(times, times[1:], strict=False)]
-    return {"per_second": len(gaps) / (times[-1] - times[0]), "longest_gap": max(gaps)}
+    return {"per_second": round(len(gaps) / (times[-1] - times[0]), 1), "longest_gap": round(max(gaps), 3)}
 
 
 def story():
     bpy.types.SpaceView3D.draw_handler_add(on_draw, (), "WINDOW", "POST_PIXEL")
     result = {}
-    yield from redraw(3)  # shaders are compiled
-    times.clear()
-    yield from redraw(SECONDS)
-    result["idle"] = measured()
+    yield from measured(3, draw=True)  # shaders are compiled
+    result["idle"] = {"redraws": (yield from measured(SECONDS, True)), "turns": (yield from measured(SECONDS, False))}
     region = next(r for r in area().regions if r.type == "WINDOW")
     with bpy.context.temp_override(window=blender_gui.window(), area=area(), region=region):
         bpy.ops.material_palette.open_photo(filepath=os.environ["PALETTE_PHOTO"])
@@ -47,21 +59,15 @@ def story():
     while run.progress <= 0.02:  # torch is imported, the engine at work
         area().tag_redraw()
         yield
-    times.clear()
-    yield from redraw(SECONDS)
+    result["extracting"] = {
+        "redraws": (yield from measured(SECONDS, True)),
+        "turns": (yield from measured(SECONDS, False)),
+    }
     assert run.running, run.error
-    result["extracting"] = measured() | {"progress": run.progress}
     bpy.ops.material_palette.cancel()
     while run.running:
         yield
     write(result | {"error": None})
-
-
-def redraw(seconds):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        area().tag_redraw()
-        yield
 
 
 def write(result):
