@@ -19,7 +19,10 @@ QUALITIES = (
     ("balanced", "Balanced", "Good textures in a reasonable time"),
     ("best", "Best", "The closest textures, slowest"),
 )
-ENGINES = (("patch", "Patch", "Grow the texture from the region's own patches; needs no network and no GPU"),)
+ENGINES = (
+    ("patch", "Patch", "Grow the texture from the region's own patches; needs no network and no GPU"),
+    ("diffusion", "Diffusion", "Let Stable Diffusion learn the region; needs weights, packages and a GPU: Preferences"),
+)
 RESOLUTION_RANGE = (64, 8192)
 # Paths that start with "//"; from Blender 4.5 on a property has to say that it takes them.
 _BLEND_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()

@@ -41,7 +41,11 @@ def engines():
     """{engine as a person calls it: names of the packages it lacks}."""
     lacking = [entry.module for entry in missing()]
     finding = [module for module in lacking if module != "torch"]
-    return {"Patch (textures)": lacking, "Auto Segment and Pick Material (regions)": finding}
+    return {
+        "Patch (textures)": lacking,
+        "Diffusion (textures)": lacking + [entry.module for entry in missing(DIFFUSION)],
+        "Auto Segment and Pick Material (regions)": finding,
+    }
 
 
 def install_command(entries, python=None):

@@ -17,6 +17,7 @@ from . import history
 from .background import BackgroundOperator
 from .palette import active_entry, put_in_palette, region_of
 from .photo import photo_reader
+from .preferences import diffusion_settings
 from .regions import read_mask_image
 
 _EXTRACTION = 0.95  # share of the time; the rest is writing
@@ -55,6 +56,7 @@ class _Order:
     folder: Path | None
     overwrite: bool
     temporary: str | None
+    diffusion: dict = field(default_factory=dict)  # settings of that engine
     warnings: list = field(default_factory=list)
 
 
@@ -209,6 +211,7 @@ def _read_order(settings, regions, seed, is_whole):
         folder=None,
         overwrite=False,
         temporary=bpy.app.tempdir,
+        diffusion=diffusion_settings(bpy.context),
     )
     if not settings.pack:
         order.folder, order.overwrite = _output_folder(settings), settings.overwrite and is_whole
@@ -258,11 +261,13 @@ def _work(order, progress, send):
     """Everything that happens on the worker; touches no bpy."""
     # importing torch takes seconds, which the window shouldn't wait for
     progress(0.0, "Getting ready")
+    from ..core.engines.diffusion import DiffusionSettings
     from ..core.output import staged
     from ..core.palette import Settings
     from ..core.region import Region
 
-    settings = Settings(**order.chosen)
+    diffusion = DiffusionSettings(**order.diffusion) if order.chosen["engine"] == "diffusion" else None
+    settings = Settings(**order.chosen, diffusion=diffusion)
     settings.check()
     progress(0.0, "Reading the photo")
     pixels, order.warnings = order.read()

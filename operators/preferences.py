@@ -1,5 +1,6 @@
 """Preferences of the extension: defaults of new scenes, what engines there are, where its folder is."""
 
+import bpy
 from bpy.props import EnumProperty, IntProperty, StringProperty
 from bpy.types import AddonPreferences, Operator
 
@@ -25,6 +26,15 @@ def apply_defaults(context, settings):
             setattr(settings, name, getattr(chosen, name))
 
 
+def diffusion_settings(context):
+    """What is chosen here of DiffusionSettings, as a dict."""
+    chosen = preferences(context)
+    if chosen is None:
+        return {}
+    model, concepts = (bpy.path.abspath(path) for path in (chosen.model, chosen.concepts))
+    return {"model": model, "concepts": concepts, "device": "" if chosen.device == "AUTO" else chosen.device}
+
+
 class MATERIAL_PALETTE_preferences(AddonPreferences):
     bl_idname = PACKAGE
 
@@ -38,6 +48,26 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
         min=RESOLUTION_RANGE[0],
         max=RESOLUTION_RANGE[1],
         subtype="PIXEL",
+    )
+    model: StringProperty(
+        name="Model",
+        description="Of engine Diffusion: a folder in diffusers' format, or a .safetensors checkpoint",
+        subtype="FILE_PATH",
+    )
+    concepts: StringProperty(
+        name="Concepts",
+        description="Folder where engine Diffusion keeps what it has learnt, to use it again; nothing is kept without",
+        subtype="DIR_PATH",
+    )
+    device: EnumProperty(
+        name="Device",
+        description="Where engine Diffusion computes; engine Patch needs the CPU only",
+        items=(
+            ("AUTO", "Automatic", "The best there is"),
+            ("cuda", "CUDA", "An NVIDIA GPU, or an AMD one under ROCm"),
+            ("mps", "Metal", "The GPU of a Mac"),
+            ("cpu", "CPU", "Slow: minutes for each material"),
+        ),
     )
     author: StringProperty(name="Author", description="Written into the assets that are made")
     licence: StringProperty(name="Licence", description="Written into the assets that are made, such as CC0")
@@ -56,6 +86,10 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
             row = box.row()
             row.label(text=name, icon="ERROR" if lacking else "CHECKMARK")
             row.label(text=f"Missing: {', '.join(lacking)}" if lacking else "Ready")
+        column = box.column()
+        column.use_property_split = True
+        for name in ("model", "concepts", "device"):
+            column.prop(self, name)
         if missing():
             column = box.column(align=True)
             for entry in missing():

@@ -34,7 +34,7 @@ def instant(monkeypatch):
     from material_palette.core import palette
     from material_palette.core.material import SVBRDF
 
-    def extract_material(pixels, region, settings, progress):
+    def extract_material(pixels, region, settings, progress, *_view_focal_engine):
         progress(0.5, "half")
         if not region.mask.any():
             raise PaletteError(f"Region '{region.name}' is empty")
@@ -308,6 +308,13 @@ def test_refusals_name_what_is_wrong(ready):
     assert not bpy.ops.material_palette.extract.poll()
 
 
+def test_engine_diffusion_says_what_it_needs(ready, data_blocks):
+    ready.engine = "diffusion"
+    before = data_blocks()
+    assert "model" in refused(bpy.ops.material_palette.extract)
+    assert data_blocks() == before
+
+
 def test_a_failed_run_leaves_nothing(ready, monkeypatch, data_blocks, temporary_folders):
     from material_palette.core import palette
 
@@ -344,7 +351,7 @@ class Endless:
     def __init__(self):
         self.begun, self.ended = threading.Event(), threading.Event()
 
-    def __call__(self, pixels, regions, settings, progress, on_material=None, photo_name=""):
+    def __call__(self, pixels, regions, settings, progress, on_material=None, photo_name="", focal=None):
         try:
             while True:
                 progress(0.3, "working")
@@ -433,7 +440,7 @@ class Stepwise:
     def __init__(self, extract_material):
         self.extract_material, self.go = extract_material, threading.Event()
 
-    def __call__(self, pixels, region, settings, progress):
+    def __call__(self, pixels, region, settings, progress, *_view_focal_engine):
         while region.name == "right" and not self.go.is_set():
             progress(0.1, "waiting")
             time.sleep(0.01)

@@ -82,8 +82,11 @@ def test_every_operator_and_setting_says_what_it_does(extension):
 
 
 def test_choices_are_those_of_the_pipeline(extension):
+    pytest.importorskip("torch")
     from material_palette import properties
-    from material_palette.core import palette
+    from material_palette.core import engines, palette
+
+    assert {identifier for identifier, *_ in properties.ENGINES} == set(engines.ENGINES)
 
     assert tuple(identifier for identifier, *_ in properties.QUALITIES) == tuple(palette.QUALITIES)
     assert tuple(properties.RESOLUTION_RANGE) == tuple(palette.RESOLUTION_RANGE)

@@ -1,8 +1,8 @@
-"""Runs inside Blender's window: how often it redraws, and how often it is free to, idle and during an extraction.
+"""Runs inside Blender's window: how often it redraws, and how often it is free to, idle and while extracting.
 
-Redraws: a draw handler counts; a timer asks for the next redraw as soon as Blender is free, as a user's mouse would. With
-software graphics that is how long drawing takes. Turns: the same timer without drawing, how often Blender comes round to
-what waits for it. Written to PALETTE_STATE as JSON: per second, and the longest gap in seconds.
+Redraws: a draw handler counts; a timer asks for the next redraw as soon as Blender is free, as a user's mouse would.
+With software graphics that is how long drawing takes. Turns: the same timer without drawing, how often Blender comes
+round to what waits for it. Written to PALETTE_STATE as JSON: per second, and the longest gap in seconds.
 """
 
 import json
