@@ -21,7 +21,8 @@ def shade(albedo, normal, roughness, light, view, metallic=0.0):
     rest is reflected. Light and viewer can be exchanged; differentiable in everything.
     Source: Walter et al. 2007 (GGX), Smith's separable masking, Schlick 1994 (Fresnel).
     """
-    half = torch.nn.functional.normalize(light + view, dim=-1)
+    half = light + view
+    half = half / half.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-6)
     nl = (normal * light).sum(-1, keepdim=True).clamp_min(0)
     nv = (normal * view).sum(-1, keepdim=True).clamp_min(1e-4)
     nh = (normal * half).sum(-1, keepdim=True).clamp_min(0)

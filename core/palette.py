@@ -41,6 +41,7 @@ class Settings:
     """
 
     engine: str = "patch"
+    decomposer: str = "unet"
     quality: str = "balanced"
     resolution: int = 1024
     seed: int = 0
@@ -53,6 +54,9 @@ class Settings:
         """Raise PaletteError naming the first setting that cannot be honoured."""
         if self.engine not in engines.ENGINES:
             raise PaletteError(f"engine '{self.engine}' is unknown; choose one of: {', '.join(engines.ENGINES)}")
+        if self.decomposer not in decomposition.DECOMPOSERS:
+            known = ", ".join(decomposition.DECOMPOSERS)
+            raise PaletteError(f"decomposer '{self.decomposer}' is unknown; choose one of: {known}")
         if self.quality not in QUALITIES:
             raise PaletteError(f"quality '{self.quality}' is unknown; choose one of: {', '.join(QUALITIES)}")
         least, most = RESOLUTION_RANGE
@@ -208,7 +212,8 @@ def extract_material(
             material.warnings += getattr(texture, "warnings", [])
             material.texture = sheet.thumbnail(np.tile(texture.pixels, (2, 2, 1)))
         with _timed(seconds, "decompose"):
-            svbrdf = decomposition.decompose(linear_from_srgb(texture.pixels), _part(progress, 0.86, 0.96))
+            share = _part(progress, 0.86, 0.96)
+            svbrdf = decomposition.decompose(linear_from_srgb(texture.pixels), share, settings.decomposer)
 
     progress(0.97, "reducing the maps")
     with _timed(seconds, "reduce"):

@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from material_palette.core.decomposition import constant, decompose
+from material_palette.core.decomposition import DECOMPOSERS, analytic, constant, decompose, unet
+from material_palette.core.errors import Cancelled, PaletteError
 from material_palette.core.exemplar import LUMINANCE
+from material_palette.core.image import linear_from_srgb
 from material_palette.core.torus import WRAP_GATE, gradient, wrap_ratio
 from textures import quiet, tileable_noise
 
@@ -14,21 +16,30 @@ def texture():
     return np.stack([grey * tint, grey, grey / tint], -1).astype(np.float32)
 
 
-def test_rolling_the_texture_rolls_the_maps(texture):
-    shift = (31, -50)
-    maps, rolled = decompose(texture, quiet), decompose(np.roll(texture, shift, (0, 1)), quiet)
-    for name in ("albedo", "normal", "height"):
-        expected = np.roll(getattr(maps, name), shift, (0, 1))
+each = pytest.mark.parametrize("decomposer", DECOMPOSERS)
+
+
+@each
+@pytest.mark.parametrize("shift", [(31, -50), (1, 0)])
+def test_rolling_the_texture_rolls_the_maps(texture, decomposer, shift):
+    maps = decompose(texture, quiet, decomposer)
+    rolled = decompose(np.roll(texture, shift, (0, 1)), quiet, decomposer)
+    for name in ("albedo", "normal", "height", "roughness"):
+        value = getattr(maps, name)
+        expected = np.roll(value, shift, (0, 1)) if np.ndim(value) > 1 else value
         assert np.abs(getattr(rolled, name) - expected).max() < 1e-3, name
 
 
-def test_all_maps_tile(texture):
-    maps = decompose(texture, quiet)
-    assert all(wrap_ratio(m) <= WRAP_GATE for m in (maps.albedo, maps.normal, maps.height))
+@each
+def test_all_maps_tile(texture, decomposer):
+    maps = decompose(texture, quiet, decomposer)
+    shown = [m for m in (maps.albedo, maps.normal, maps.height, maps.roughness) if np.ndim(m) > 1]
+    assert all(wrap_ratio(m) <= WRAP_GATE for m in shown)
 
 
-def test_normal_is_the_gradient_of_the_height(texture):
-    maps = decompose(texture, quiet)
+@each
+def test_normal_is_the_gradient_of_the_height(texture, decomposer):
+    maps = decompose(texture, quiet, decomposer)
     dx, dy = gradient(torch.from_numpy(maps.height) * texture.shape[1])
     assert np.allclose(np.linalg.norm(maps.normal, axis=-1), 1, atol=1e-5)
     assert np.allclose(maps.normal[..., 0] / maps.normal[..., 2], -dx.numpy(), atol=1e-4)
@@ -36,10 +47,66 @@ def test_normal_is_the_gradient_of_the_height(texture):
     assert abs(maps.height.mean()) < 1e-6
 
 
+@each
+def test_any_size(decomposer):
+    texture = linear_from_srgb(tileable_noise(70, 33)[..., None].repeat(3, -1).astype(np.float32))
+    maps = decompose(texture, quiet, decomposer)
+    assert maps.albedo.shape == maps.normal.shape == (70, 33, 3)
+    assert 0 <= maps.albedo.min() and maps.albedo.max() <= 1
+    assert np.isfinite(maps.height).all()
+
+
+@each
+def test_cancelling_ends_it(texture, decomposer):
+    def stop(fraction, message):
+        if fraction > 0.3:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        decompose(texture, stop, decomposer)
+
+
+@each
+def test_a_constant_texture_is_flat_and_keeps_its_colour(decomposer):
+    maps = decompose(np.full((64, 64, 3), 0.3, np.float32), quiet, decomposer)
+    assert np.ptp(maps.albedo) < 0.02
+    assert np.abs(maps.albedo - 0.3).max() < 0.06
+    assert maps.normal[..., 2].min() > 0.999
+
+
+@each
+def test_shading_of_a_flat_surface_is_no_relief(decomposer):
+    v = np.linspace(0, 2 * np.pi, 256, endpoint=False, dtype=np.float32)
+    shading = 0.35 + 0.15 * np.sin(v)[:, None] * np.sin(v)[None]
+    maps = decompose(np.repeat(shading[..., None], 3, -1).astype(np.float32), quiet, decomposer)
+    assert maps.normal[..., 2].min() > 0.995
+
+
+def test_an_unknown_decomposer_is_named():
+    with pytest.raises(PaletteError, match="nonsense.*unet"):
+        decompose(np.zeros((32, 32, 3), np.float32), quiet, "nonsense")
+
+
+def test_tiles_give_what_one_pass_gives(monkeypatch):
+    shades = tileable_noise(640, 640)
+    texture = (0.1 + 0.5 * np.stack([shades, shades**2, shades], -1)).astype(np.float32)
+    monkeypatch.setattr(unet, "TILE", (384, 640))
+    tiled = decompose(texture, quiet)
+    monkeypatch.setattr(unet, "TILE", (640, 640))
+    whole = decompose(texture, quiet)
+    for name in ("albedo", "normal", "roughness"):
+        assert np.abs(getattr(tiled, name) - getattr(whole, name)).max() < 1 / 255, name
+
+
+def test_weights_of_another_network_are_refused_by_name():
+    with pytest.raises(PaletteError, match=r"stlpips_alex\.safetensors"):
+        unet.load(unet.WEIGHTS.with_name("stlpips_alex.safetensors"))
+
+
 def test_a_bright_bump_faces_up_at_its_upper_side():
     y, x = np.mgrid[-32:32, -32:32].astype(np.float32)
     bump = 0.2 + 0.5 * np.exp(-(x**2 + y**2) / 50)
-    maps = decompose(np.repeat(bump[..., None], 3, -1), quiet)
+    maps = analytic.decompose(np.repeat(bump[..., None], 3, -1), quiet)
     assert maps.normal[26, 32, 1] > 0.02
     assert maps.normal[38, 32, 1] < -0.02
     assert maps.normal[32, 26, 0] < -0.02
@@ -51,15 +118,9 @@ def test_a_change_of_colour_alone_is_no_relief():
     red, green = np.array([0.6, 0.1, 0.1]), np.array([0.1, 0.0, 0.1])
     green[1] = (red @ LUMINANCE - green @ LUMINANCE) / LUMINANCE[1]
     texture = np.broadcast_to(stripes * red + (1 - stripes) * green, (64, 64, 3)).astype(np.float32)
-    maps = decompose(texture, quiet)
+    maps = analytic.decompose(texture, quiet)
     assert maps.normal[..., 2].min() > 0.999
     assert np.abs(maps.albedo - texture).max() < 0.01
-
-
-def test_a_constant_texture_is_flat():
-    maps = decompose(np.full((32, 32, 3), 0.3, np.float32), quiet)
-    assert np.allclose(maps.albedo, 0.3, atol=1e-5)
-    assert np.allclose(maps.normal, (0, 0, 1), atol=1e-5)
 
 
 def test_a_uniform_regions_material_has_no_map():

@@ -1,4 +1,4 @@
-"""How the constants of `core/decomposition.py` were found: a search on training materials, checked on held-out ones.
+"""How the constants of `core/decomposition/analytic.py` were found: a search on training materials, checked on others.
 
     .venv/bin/python training/analytic.py DATA
 
@@ -20,7 +20,8 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
-from material_palette.core import brdf, decomposition  # noqa: E402
+from material_palette.core import brdf  # noqa: E402
+from material_palette.core.decomposition import analytic  # noqa: E402
 from material_palette.core.image import linear_from_srgb  # noqa: E402
 from material_palette.core.torus import blur  # noqa: E402
 
@@ -60,7 +61,7 @@ def rendering(folder: Path, seed: int) -> dict[str, torch.Tensor]:
 def errors(renderings) -> tuple[float, float]:
     albedo, normal = [], []
     for r in renderings:
-        found = decomposition.decompose(r["pixels"].numpy(), lambda fraction, message: None)
+        found = analytic.decompose(r["pixels"].numpy(), lambda fraction, message: None)
         albedo.append((torch.from_numpy(found.albedo) - r["albedo"]).square().mean())
         normal.append((torch.from_numpy(found.normal) - r["normal"]).square().mean())
     return float(np.mean(albedo)), float(np.mean(normal))
@@ -108,15 +109,15 @@ def main() -> None:
         albedo = np.mean([float((r["pixels"] - r["albedo"]).square().mean()) for r in part])
         normal = np.mean([float((FLAT - r["normal"]).square().mean()) for r in part])
         print(f"nothing    {name}: albedo {albedo:.5f} normal {normal:.5f}")
-    shipped = {name: getattr(decomposition, name) for name in ("CHROMA", "SHADING", "RELIEF")}
+    shipped = {name: getattr(analytic, name) for name in ("CHROMA", "SHADING", "RELIEF")}
     trials = {"CHROMA": (0.03, 0.1, 0.3), "SHADING": (0.0, 0.2, 0.3, 0.5), "RELIEF": (0.1, 0.2, 0.4, 0.8)}
     for name, values in trials.items():
         for value in values:
-            setattr(decomposition, name, value)
+            setattr(analytic, name, value)
             albedo, normal = errors(training)
             mark = "  <- shipped" if value == shipped[name] else ""
             print(f"{name:8} {value:4}  training: albedo {albedo:.5f} normal {normal:.5f}{mark}", flush=True)
-        setattr(decomposition, name, shipped[name])
+        setattr(analytic, name, shipped[name])
     albedo, normal = errors(held_out)
     print(f"shipped    held out: albedo {albedo:.5f} normal {normal:.5f}")
     roughness_errors(training, held_out)

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from .exemplar import LUMINANCE
-from .material import SVBRDF
-from .torus import frequencies, gradient, integrate, normal_from_height
+from ..exemplar import LUMINANCE
+from ..material import SVBRDF
+from ..torus import frequencies, gradient, integrate, normal_from_height
 
 # fitted by training/analytic.py on the training materials
 CHROMA = 0.1  # change of log chromaticity per pixel at which a gradient counts as albedo
@@ -40,11 +40,6 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SV
     normal = normal_from_height(height)
     progress(1.0, "computing normals")
     return SVBRDF(albedo.numpy(), normal.numpy(), ROUGHNESS, height.numpy())
-
-
-def constant(colour: np.ndarray) -> SVBRDF:
-    """The SVBRDF of a uniform region: colour (3,) linear, flat."""
-    return SVBRDF(np.clip(colour, 0, 1).astype(np.float32), np.array([0, 0, 1], np.float32), ROUGHNESS)
 
 
 def _shading(pixels: torch.Tensor) -> torch.Tensor:

