@@ -1,7 +1,9 @@
 """Preferences of the extension: defaults of new scenes, what engines there are, where its folder is."""
 
+from pathlib import Path
+
 import bpy
-from bpy.props import EnumProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 from bpy.types import AddonPreferences, Operator
 
 from ..core import dependencies
@@ -32,7 +34,14 @@ def diffusion_settings(context):
     if chosen is None:
         return {}
     model, concepts = (bpy.path.abspath(path) for path in (chosen.model, chosen.concepts))
-    return {"model": model, "concepts": concepts, "device": "" if chosen.device == "AUTO" else chosen.device}
+    if not concepts and history.folder():
+        concepts = str(Path(history.folder()) / "concepts")
+    return {
+        "model": model,
+        "concepts": concepts,
+        "device": "" if chosen.device == "AUTO" else chosen.device,
+        "online": chosen.fetch and bpy.app.online_access,
+    }
 
 
 class MATERIAL_PALETTE_preferences(AddonPreferences):
@@ -51,12 +60,16 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
     )
     model: StringProperty(
         name="Model",
-        description="Of engine Diffusion: a folder in diffusers' format, or a .safetensors checkpoint",
+        description="Of engine Diffusion: a folder in diffusers' format, a .safetensors checkpoint, or a hub id",
         subtype="FILE_PATH",
+    )
+    fetch: BoolProperty(
+        name="Fetch the Model",
+        description="Let a hub id be fetched, several GB, where Blender's own Allow Online Access is on too",
     )
     concepts: StringProperty(
         name="Concepts",
-        description="Folder where engine Diffusion keeps what it has learnt, to use it again; nothing is kept without",
+        description="Folder where engine Diffusion keeps what it has learnt, to use it again; else the extension's own",
         subtype="DIR_PATH",
     )
     device: EnumProperty(
@@ -88,7 +101,7 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
             row.label(text=f"Missing: {', '.join(lacking)}" if lacking else "Ready")
         column = box.column()
         column.use_property_split = True
-        for name in ("model", "concepts", "device"):
+        for name in ("model", "fetch", "concepts", "device"):
             column.prop(self, name)
         if missing():
             column = box.column(align=True)

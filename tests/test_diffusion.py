@@ -548,3 +548,50 @@ def test_concept_file_says_what_it_is(concept, tmp_path):
         "crops.safetensors",
         "lora.safetensors",
     ]
+
+
+# ---------------------------------------------------------------- commands that use the engine
+
+
+def load_script(path):
+    import importlib.util
+    from pathlib import Path
+
+    file = Path(__file__).resolve().parent.parent / path
+    spec = importlib.util.spec_from_file_location(file.stem + "_script", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_texsd_makes_every_class_and_goes_on(folders, tmp_path, capsys):
+    texsd = load_script("training/texsd.py")
+    assert len(set(texsd.CLASSES)) == 130
+    arguments = ["--model", str(folders["epsilon"]), "-o", str(tmp_path), "--classes", "red brick", "sand"]
+    arguments += ["--resolution", "32", "--steps", "2", "--per-class"]
+    assert texsd.main([*arguments, "1"]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.png")}
+    assert {path.parent.name for path in before} == {"red_brick", "sand"}
+    assert texsd.main([*arguments, "2"]) == 0
+    assert len(list(tmp_path.rglob("*.png"))) == 4 and all(path.read_bytes() == b for path, b in before.items())
+    content = json.loads((tmp_path / "texsd.json").read_text())["textures"]
+    assert len({entry["seed"] for entry in content.values()}) == 4
+    assert "red brick" in content["red_brick/0000.png"]["prompt"]
+    assert texsd.main([*arguments, "2", "--seed", "1"]) == 2 and "name another folder" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_ablation_fills_both_tables(folders, tmp_path, capsys, monkeypatch):
+    import cv2
+
+    ablation = load_script("benchmarks/diffusion.py")
+    monkeypatch.setattr(diffusion, "CROP_SIDES", {False: 32, True: 32})
+    cv2.imwrite(str(tmp_path / "photo.png"), np.rint(PHOTO * 255).astype(np.uint8))
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "stone.png"), np.full(PHOTO.shape[:2], 255, np.uint8))
+    arguments = ["--model", str(folders["epsilon"]), "--photo", str(tmp_path / "photo.png"), "--masks"]
+    arguments += [str(tmp_path / "masks"), "-o", str(tmp_path / "out"), "--seeds", "1", "--resolution", "32"]
+    assert ablation.main([*arguments, "--tuning-steps", "1", "--steps", "1"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"| {name} |" in said for name in (*ablation.INVERSIONS, *ablation.WORDINGS))
+    assert len(json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]) == 8 + 3 * 4

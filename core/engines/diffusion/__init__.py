@@ -153,7 +153,8 @@ class Engine:
                     progress((i + fraction) / candidates, number + message)
 
                 prompt = settings.prompt or PROMPTS[int(torch.randint(len(PROMPTS), (1,), generator=generator))]
-                texture = self._sample_once(model, prompt, concept, shape, steps, generator, report)
+                prompt = prompt.replace("S*", concept.token)
+                texture = self._sample_once(model, prompt, concept.colour, shape, steps, generator, report)
                 if candidates > 1:
                     texture.distance = sampling.distance(texture.pixels, concept.crops)
                 if best is None or texture.distance < best.distance:
@@ -163,15 +164,31 @@ class Engine:
         progress(1.0, "sampled")
         return best
 
-    def _sample_once(self, model: Model, prompt: str, concept: Concept, shape, steps, generator, progress) -> Texture:
+    def sample_prompt(
+        self, prompt: str, size: tuple[int, int], seed: int, steps: int, progress: Progress = lambda f, m: None
+    ) -> Texture:
+        """A tileable texture (H, W) px of what the model itself knows by a prompt, in the colours that it has."""
+        generator = torch.Generator().manual_seed(seed)
+        with self._working(), torch.no_grad():
+            model = self.model(progress)
+            memory.fit(model, self.settings, model.window)
+            tuning.reset_lora(model)
+            texture = self._sample_once(model, prompt, None, latent_shape(model, size), steps, generator, progress)
+        texture.pixels = torus.resize(texture.pixels, size).clip(0, 1)
+        return texture
+
+    def _sample_once(
+        self, model: Model, prompt: str, colour: tuple | None, shape, steps, generator, progress
+    ) -> Texture:
         with model.at_work(*model.encoders):
-            text, nothing = model.encode([prompt.replace("S*", concept.token)]), model.nothing()
+            text, nothing = model.encode([prompt]), model.nothing()
         with model.at_work("unet"):
             latents = sampling.sample_latents(
                 model, text, nothing, shape, steps, generator, self.settings, lambda f, m: progress(0.9 * f, m)
             )
         pixels = sampling.decode(model, latents, lambda f, m: progress(0.9 + 0.09 * f, m))
-        pixels = sampling.match_colour(pixels, *concept.colour)
+        if colour is not None:
+            pixels = sampling.match_colour(pixels, *colour)
         if torus.wrap_ratio(pixels) > torus.WRAP_GATE:
             progress(0.99, "closing the seam")
             pixels = torus.close_seam(torch.from_numpy(pixels)).clamp(0, 1).numpy()

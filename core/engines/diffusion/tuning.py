@@ -219,13 +219,15 @@ def tune(
     settings: DiffusionSettings,
     progress: Progress,
     state: Path | None = None,
+    only: tuple[str, ...] = tuple(TARGETS),
 ) -> tuple[dict[str, np.ndarray], list[float]]:
     """Learn a concept from crops (n, c, c, 3) uint8: the low-rank weights, and the loss every CHECK_EVERY steps.
 
     The model has its low-rank weights (`add_lora`); no other weight changes. state: file that the run is kept in while
-    it is not done, and goes on from when it is there. Cancelling ends it within one step and keeps the state.
+    it is not done, and goes on from when it is there. Cancelling ends it within one step and keeps the state. only: the
+    parts that learn.
     """
-    parameters = lora_parameters(model)
+    parameters = {name: p for name, p in lora_parameters(model).items() if name.split(".")[0] in only}
     for parameter in parameters.values():
         parameter.requires_grad_(True)
     optimiser = torch.optim.AdamW(parameters.values(), LEARNING_RATE, (0.9, 0.999), weight_decay=WEIGHT_DECAY)
