@@ -26,6 +26,9 @@ SMOOTHNESS = 0.3  # sigma of what counts as slow, in sides of the square with th
 LEAST_SIGMA = 12.0  # px
 # of a shadow; read off the training materials, shadows and two-tone surfaces
 LEAST_STEP = 0.2  # of log luminance
+MOST_STEP = 2.3  # the same; one to ten
+MOST_ADDED, MOST_TAKEN = 0.4, 1.4  # change of log contrast, from lit to shaded
+NOISE = 0.01  # contrast of a cell that sensor and rounding make
 LEAST_SCORE = 0.62
 REACH = 0.06  # sides: how far beside its border the two sides are compared
 STRETCH = 0.07  # sides: length of the border that is judged as one
@@ -138,7 +141,7 @@ def _find_shadow(x: np.ndarray, inside: np.ndarray) -> "_Border | None":
         return None
     best, chosen = LEAST_SCORE, None
     for lit in _divisions(x @ LUMINANCE, inside):
-        lit = _without_specks(_sharpened(x, inside, lit), inside, max(6, area // 250))
+        lit = without_specks(sharpened(x, inside, lit), inside, max(6, area // 250))
         if not 0.05 < lit.sum() / area < 0.95:
             continue
         border = _border(x, inside, lit)
@@ -183,8 +186,8 @@ def _otsu(values: np.ndarray) -> float:
     return low + (threshold + 0.5) / 255 * (high - low)
 
 
-def _sharpened(x: np.ndarray, inside: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    """The classes by the likelihood of each pixel's colour within them, with a short border.
+def sharpened(x: np.ndarray, inside: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Two classes (h, w) bool by the likelihood of each log pixel of x (h, w, 3) within them, with a short border.
 
     The colours are histograms of log luminance and log R/B, learnt from the classes' insides; threshold dynamics
     shortens the border, from a coarse scale to a fine one.
@@ -214,7 +217,8 @@ def _sharpened(x: np.ndarray, inside: np.ndarray, lit: np.ndarray) -> np.ndarray
     return lit
 
 
-def _without_specks(lit: np.ndarray, inside: np.ndarray, least: int) -> np.ndarray:
+def without_specks(lit: np.ndarray, inside: np.ndarray, least: int) -> np.ndarray:
+    """The classes with components of fewer than `least` cells given to the other one."""
     for members in (lit, inside & ~lit):
         count, labels, sizes, _ = cv2.connectedComponentsWithStats(members.astype(np.uint8), connectivity=4)
         for k in range(1, count):
@@ -276,8 +280,24 @@ def _border(x: np.ndarray, inside: np.ndarray, lit: np.ndarray) -> _Border | Non
     coloured = green > max(GREENEST, 0.06 / height) or blue < WARMEST
     if coloured or length > LONGEST or (length > LONGEST_PLAIN and blue < BLUISH):
         return None
+    if height > MOST_STEP or not _same_texture(x, inside, distance):
+        return None
     score = same - 0.5 * float(np.median(off)) / height - 0.02 * length
     return _Border(distance.astype(np.float32), sigma, step.astype(np.float32), score)
+
+
+def _same_texture(x: np.ndarray, inside: np.ndarray, distance: np.ndarray) -> bool:
+    """Whether the two sides have about the same contrast: a shadow takes relief away, it adds nothing."""
+    y = x @ LUMINANCE
+    lit, shaded = inside & (distance > UNSURE), inside & (distance < -UNSURE)
+    if min(lit.sum(), shaded.sum()) < 50:
+        return False
+    for sigma in (1.0, 3.0):
+        detail = y - masked_blur(y, inside, sigma)
+        change = np.log((detail[lit].std() + NOISE) / (detail[shaded].std() + NOISE))
+        if not -MOST_ADDED < change < MOST_TAKEN:
+            return False
+    return True
 
 
 def _nearest(members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 from .delighting import LUMINANCE as LUMINANCE
 from .delighting import find_light
 from .image import srgb_from_linear
+from .outliers import find_foreign
 
 LARGEST = 1536  # px: side of what is cut at most; bounds the memory of learning
 NOISE_FLOOR = 2.5 / 255  # sRGB-encoded contrast below which a surface has one colour
@@ -41,8 +42,8 @@ def cut_exemplar(pixels: np.ndarray, mask: np.ndarray, flatten: bool = True) -> 
     """Cut a region out of a photo, leave out what isn't fit to learn from, and flatten its illumination.
 
     pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel. Left out are pixels without colour (too
-    bright or too dark for the camera) and the borders of cast shadows. Of a region that spreads wider than LARGEST the
-    fullest part is cut.
+    bright or too dark for the camera), another material at the region's border and the borders of cast shadows. Of a
+    region that spreads wider than LARGEST the fullest part is cut.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -56,6 +57,12 @@ def cut_exemplar(pixels: np.ndarray, mask: np.ndarray, flatten: bool = True) -> 
     shading = np.ones_like(pixels)
     if flatten:
         light = find_light(pixels, mask)
+        foreign = find_foreign(pixels / light.shading, mask)
+        left = _less(mask, foreign)
+        if foreign.any() and left is not mask:
+            share = (mask.sum() - left.sum()) / mask.sum()
+            warnings.append(f"{share:.0%} of the region looks like another material and is left out")
+            mask, light = left, find_light(pixels, left)
         shading = light.shading
         if light.shaded:
             warnings.append(f"{light.shaded:.0%} of the region lies in a cast shadow; it was balanced with the rest")
