@@ -23,6 +23,10 @@ ENGINES = (
     ("patch", "Patch", "Grow the texture from the region's own patches; needs no network and no GPU"),
     ("diffusion", "Diffusion", "Let Stable Diffusion learn the region; needs weights, packages and a GPU: Preferences"),
 )
+WHITE_BALANCES = (
+    ("off", "As in the Photo", "Keep the photo's own white balance"),
+    ("region", "Grey on Average", "Take the light's colour from the region: for plaster, concrete and other greys"),
+)
 RESOLUTION_RANGE = (64, 8192)
 # Paths that start with "//"; from Blender 4.5 on a property has to say that it takes them.
 _BLEND_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
@@ -193,7 +197,10 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         description="How wide one tile of the texture is on a surface whose UV map is in metres",
     )
     flatten: BoolProperty(
-        name="Flatten Light", default=True, description="Take slow changes of light out of the photo before synthesis"
+        name="Flatten Light", default=True, description="Take slow changes of light and cast shadows out of the photo"
+    )
+    white_balance: EnumProperty(
+        name="White Balance", items=WHITE_BALANCES, description="What to do about the colour of the light"
     )
     pack: BoolProperty(
         name="Pack Textures",

@@ -85,6 +85,7 @@ def _parser() -> argparse.ArgumentParser:
         help="metres between two photo px on a region's surface: 'floor:10,20 90,20=0.6'",
     )
     extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
+    extract.add_argument("--white-balance", default="off", help="off, or region: the region is grey on average (off)")
     extract.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
     extract.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
     diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)")
@@ -136,6 +137,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         seed=arguments.seed,
         rectify=arguments.rectify,
         flatten=not arguments.no_flatten,
+        white_balance=arguments.white_balance,
         metres_per_tile=arguments.metres_per_tile,
         diffusion=_diffusion(arguments) if arguments.engine == "diffusion" else None,
     )

@@ -14,6 +14,7 @@ al. 2006 (log chromaticity of shadows); Guo, Dai and Hoiem 2011 (equal texture o
 1992 (threshold dynamics).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -42,15 +43,21 @@ UNSURE = 1.5  # cells beside a border that may lie on its other side
 
 @dataclass
 class Light:
-    """What falls on a region: shading (h, w, 3) float32 > 0; unsure (h, w) bool, the border of a shadow, where it isn't
-    known well; shaded, the share of the region in a cast shadow."""
+    """What falls on a region.
+
+    shading (h, w, 3) float32 > 0, of which cast (h, w, 3) is the cast shadow's part; unsure (h, w) bool, the border of
+    a shadow, where it isn't known well; shaded, the share of the region in a cast shadow.
+    """
 
     shading: np.ndarray
+    cast: np.ndarray
     unsure: np.ndarray
     shaded: float
 
 
-def find_light(pixels: np.ndarray, mask: np.ndarray) -> Light:
+def find_light(
+    pixels: np.ndarray, mask: np.ndarray, progress: Callable[[float], None] = lambda fraction: None
+) -> Light:
     """The illumination of pixels (h, w, 3) float32 linear within mask (h, w) bool.
 
     Slow changes have a geometric mean of 1 over the region; a cast shadow is less than 1, its lit side 1.
@@ -58,21 +65,23 @@ def find_light(pixels: np.ndarray, mask: np.ndarray) -> Light:
     h, w = mask.shape
     grid, inside, scale = reduce_to_grid(np.log(np.maximum(pixels, DARKEST)), mask)
     side = float(np.sqrt(inside.sum()))
-    shadow = _find_shadow(grid, inside)
+    progress(0.1)
+    shadow = _find_shadow(grid, inside, lambda fraction: progress(0.1 + 0.7 * fraction))
     cast = (
         np.zeros_like(grid) if shadow is None else shadow.step * (_matte(shadow.distance, shadow.sigma) - 1)[..., None]
     )
     slow = _slow(grid - cast, inside, max(LEAST_SIGMA / scale, SMOOTHNESS * side))
     slow -= slow[inside].mean(0)
     whole = cv2.resize(slow, (w, h), interpolation=cv2.INTER_LINEAR)
+    cast_there = np.zeros_like(whole)
     unsure, shaded = np.zeros((h, w), bool), 0.0
     if shadow is not None:
         distance = cv2.resize(shadow.distance, (w, h), interpolation=cv2.INTER_LINEAR)
-        whole += shadow.step * (_matte(distance, shadow.sigma) - 1)[..., None]
+        cast_there = shadow.step * (_matte(distance, shadow.sigma) - 1)[..., None]
         unbalanced = _unbalanced((grid - cast - slow) @ LUMINANCE, inside, shadow).astype(np.uint8)
         unsure = mask & ((np.abs(distance) < UNSURE) | (cv2.resize(unbalanced, (w, h)) > 0))
         shaded = float((distance[mask] < 0).mean())
-    return Light(np.exp(whole), unsure, shaded)
+    return Light(np.exp(whole + cast_there), np.exp(cast_there), unsure, shaded)
 
 
 def _unbalanced(rest: np.ndarray, inside: np.ndarray, shadow: "_Border") -> np.ndarray:
@@ -135,12 +144,14 @@ def _slow(x: np.ndarray, inside: np.ndarray, sigma: float) -> np.ndarray:
 # ---------------------------------------------------------------- cast shadows
 
 
-def _find_shadow(x: np.ndarray, inside: np.ndarray) -> "_Border | None":
+def _find_shadow(x: np.ndarray, inside: np.ndarray, progress: Callable[[float], None]) -> "_Border | None":
     area = int(inside.sum())
     if area < 400:
         return None
     best, chosen = LEAST_SCORE, None
-    for lit in _divisions(x @ LUMINANCE, inside):
+    divisions = _divisions(x @ LUMINANCE, inside)
+    for i, lit in enumerate(divisions):
+        progress((i + 1) / (len(divisions) + 1))
         lit = without_specks(sharpened(x, inside, lit), inside, max(6, area // 250))
         if not 0.05 < lit.sum() / area < 0.95:
             continue

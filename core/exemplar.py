@@ -1,6 +1,7 @@
 """From a photo's region to an exemplar: crop, leave out what has no colour, flatten the illumination, find out whether
 it is of one colour."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ from .outliers import find_foreign
 
 LARGEST = 1536  # px: side of what is cut at most; bounds the memory of learning
 NOISE_FLOOR = 2.5 / 255  # sRGB-encoded contrast below which a surface has one colour
+WHITE_BALANCES = ("off", "region")
 CLIPPED = 0.98  # linear; above it the camera saw white
 BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
 PATCH = 7  # px: what an engine learns from at least
@@ -37,13 +39,25 @@ class Exemplar:
     uniform: np.ndarray | None
     warnings: list[str]
 
+    def picture(self) -> np.ndarray:
+        """The exemplar to look at (h, w, 3) uint8, sRGB-encoded; what is not learnt from is dark."""
+        encoded = srgb_from_linear(np.clip(self.pixels, 0, 1))
+        return np.rint(np.where(self.mask[..., None], encoded, 0.1) * 255).astype(np.uint8)
 
-def cut_exemplar(pixels: np.ndarray, mask: np.ndarray, flatten: bool = True) -> Exemplar:
+
+def cut_exemplar(
+    pixels: np.ndarray,
+    mask: np.ndarray,
+    flatten: bool = True,
+    white_balance: str = "off",
+    progress: Callable[[float, str], None] = lambda fraction, message: None,
+) -> Exemplar:
     """Cut a region out of a photo, leave out what isn't fit to learn from, and flatten its illumination.
 
     pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel. Left out are pixels without colour (too
     bright or too dark for the camera), another material at the region's border and the borders of cast shadows. Of a
-    region that spreads wider than LARGEST the fullest part is cut.
+    region that spreads wider than LARGEST the fullest part is cut. With white_balance "region" the colour of the light
+    is taken from the region, whose mean is taken to be grey: for plaster, concrete, snow.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -56,18 +70,23 @@ def cut_exemplar(pixels: np.ndarray, mask: np.ndarray, flatten: bool = True) -> 
     mask = _without_colourless(pixels, mask, warnings)
     shading = np.ones_like(pixels)
     if flatten:
-        light = find_light(pixels, mask)
-        foreign = find_foreign(pixels / light.shading, mask)
+        light = find_light(pixels, mask, lambda fraction: progress(0.4 * fraction, "evening the light"))
+        foreign = find_foreign(pixels / light.cast, mask)  # a slow change of light may be another material
         left = _less(mask, foreign)
         if foreign.any() and left is not mask:
             share = (mask.sum() - left.sum()) / mask.sum()
             warnings.append(f"{share:.0%} of the region looks like another material and is left out")
-            mask, light = left, find_light(pixels, left)
+            mask = left
+            light = find_light(pixels, mask, lambda fraction: progress(0.5 + 0.4 * fraction, "evening the light"))
         shading = light.shading
         if light.shaded:
             warnings.append(f"{light.shaded:.0%} of the region lies in a cast shadow; it was balanced with the rest")
             mask = _less(mask, light.unsure)
+    if white_balance == "region":
+        mean = (pixels / shading)[mask].mean(0)
+        shading = shading * (mean / max(float(mean @ LUMINANCE), 1e-6)).clip(1e-3)
     pixels = pixels / shading
+    progress(1.0, "evening the light")
     return Exemplar(pixels, mask, shading, _uniform_colour(pixels, mask), warnings)
 
 

@@ -17,7 +17,7 @@ import torch
 from . import brdf, decomposition, engines, rectification, reduction, sheet
 from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
-from .exemplar import cut_exemplar
+from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
@@ -26,6 +26,7 @@ VERSION = 1  # of palette.json
 QUALITIES = tuple(engines.patch.PRESETS)
 RESOLUTION_RANGE = (64, 8192)
 PREVIEW = 256  # px
+EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
 
@@ -36,8 +37,9 @@ class Settings:
 
     resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object,
     where a region's measure does not tell; rectify: "auto" brings a slanted region to the front, by its corners or by
-    the plane that is found, "quad" by its corners only, "off" never; flatten takes the slow change of illumination out
-    of a region before synthesis. diffusion: settings of the engine of that name.
+    the plane that is found, "quad" by its corners only, "off" never; flatten takes slow changes of light and cast
+    shadows out of a region; white_balance "region" takes the region's mean for grey. diffusion: settings of the engine
+    of that name.
     """
 
     engine: str = "patch"
@@ -47,6 +49,7 @@ class Settings:
     seed: int = 0
     rectify: str = "auto"
     flatten: bool = True
+    white_balance: str = "off"
     metres_per_tile: float = 1.0
     diffusion: DiffusionSettings | None = None
 
@@ -66,6 +69,10 @@ class Settings:
             raise PaletteError(f"seed {self.seed} is out of range; choose a whole number from 0 to 2^63 - 1")
         if self.rectify not in rectification.MODES:
             raise PaletteError(f"rectify '{self.rectify}' is unknown; choose one of: {', '.join(rectification.MODES)}")
+        if self.white_balance not in WHITE_BALANCES:
+            raise PaletteError(
+                f"white balance '{self.white_balance}' is unknown; choose one of: {', '.join(WHITE_BALANCES)}"
+            )
         if not (0 < self.metres_per_tile < float("inf")):
             raise PaletteError(f"metres per tile is {self.metres_per_tile}; choose a positive length")
         if self.engine == "diffusion":
@@ -76,9 +83,9 @@ class Settings:
 class Material:
     """One region's outcome. status is "ok", or "failed" with the reason in error and no SVBRDF.
 
-    exemplar (h, w, 3) and texture (H, W, 3) are sRGB-encoded uint8 for looking at; preview (256, 256, 4) float32 is
-    a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced says which maps became values; rectification
-    is the record for palette.json.
+    exemplar (h, w, 3), dark where nothing is learnt from, and texture (H, W, 3) are sRGB-encoded uint8 for looking at;
+    preview (256, 256, 4) float32 is a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced says which
+    maps became values; rectification is the record for palette.json.
     """
 
     name: str
@@ -193,12 +200,11 @@ def extract_material(
         material.rectification = flat.record()
         if region.measure is not None:
             material.metres_per_tile = settings.resolution * rectification.metres_per_texel(*region.measure, flat)
-    progress(0.02, "cutting the exemplar")
     with _timed(seconds, "exemplar"):
-        exemplar = cut_exemplar(flat.pixels, flat.mask, settings.flatten)
+        exemplar = _exemplar(flat, settings, _part(progress, 0.02, 0.03))
         encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
         material.warnings += exemplar.warnings
-        material.exemplar = sheet.thumbnail(np.where(exemplar.mask[..., None], encoded, 0.1))
+        material.exemplar = exemplar.picture()
 
     if exemplar.uniform is not None:
         material.warnings.append("the region has one colour up to noise; the material is a constant")
@@ -225,6 +231,22 @@ def extract_material(
     return material
 
 
+def preview_exemplar(
+    pixels: np.ndarray, region: Region, settings: Settings, progress: Progress, focal: float | None = None
+) -> tuple[np.ndarray, list[str]]:
+    """What `extract_material` would learn from, as a picture (h, w, 3) uint8 sRGB-encoded, and the warnings."""
+    settings.check()
+    check_region(region)
+    flat = _rectified(pixels, region, settings, None, focal, _part(progress, 0.0, 0.5))
+    exemplar = _exemplar(flat, settings, _part(progress, 0.5, 1.0))
+    return exemplar.picture(), flat.warnings + exemplar.warnings
+
+
+def _exemplar(flat: rectification.Rectification, settings: Settings, progress: Progress) -> Exemplar:
+    progress(0.0, "cutting the exemplar")
+    return cut_exemplar(flat.pixels, flat.mask, settings.flatten, settings.white_balance, progress)
+
+
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
     if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
         return rectification.Rectification(pixels, region.mask)
@@ -237,12 +259,15 @@ def _rectified(pixels, region, settings, view, focal, progress) -> rectification
 def write_material(material: Material, folder: Path) -> dict:
     """Write a material's maps and its .json into `folder` (made if missing); return its record for palette.json.
 
+    What it was learnt from is written into EXEMPLARS beside the folder.
+
     Files in the record are relative to the folder's parent. Normal Map convention is OpenGL (+Y up).
     """
     name = file_name(material.name)
     record = {
         "name": material.name,
         "status": material.status,
+        "exemplar": None,
         "maps": {},
         "metres_per_tile": material.metres_per_tile,
         "rectification": material.rectification,
@@ -251,6 +276,10 @@ def write_material(material: Material, folder: Path) -> dict:
         "warnings": material.warnings,
         "error": material.error,
     }
+    if material.exemplar is not None:
+        record["exemplar"] = f"{EXEMPLARS}/{name}.png"
+        (folder.parent / EXEMPLARS).mkdir(parents=True, exist_ok=True)
+        write_image(folder.parent / record["exemplar"], material.exemplar / np.float32(255))
     if material.svbrdf is None:
         return record
     folder.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ CELL = 256  # px
 GAP = 8
 TITLE = 28
 BACKGROUND = 0.13
-COLUMNS = ("region", "texture, tiled 2 x 2", "base colour", "normal", "roughness", "height", "rendered")
+COLUMNS = ("exemplar", "texture, tiled 2 x 2", "base colour", "normal", "roughness", "height", "rendered")
 
 
 def region_colour(index: int) -> tuple[float, float, float]:

@@ -198,6 +198,7 @@ def _read_order(settings, regions, seed, is_whole):
         "resolution": settings.resolution,
         "seed": seed,
         "flatten": settings.flatten,
+        "white_balance": settings.white_balance,
         "metres_per_tile": settings.metres_per_tile,
     }
     read = photo_reader(settings.photo)
@@ -271,7 +272,7 @@ def _work(order, progress, send):
     settings.check()
     progress(0.0, "Reading the photo")
     pixels, order.warnings = order.read()
-    regions = [Region(name, _nearest(mask, pixels.shape[:2])) for name, mask in order.masks.items()]
+    regions = [Region(name, nearest(mask, pixels.shape[:2])) for name, mask in order.masks.items()]
     place = staged(order.folder, order.overwrite) if order.folder else _temporary(order.temporary)
     with place as staging:
         made, cancelled = _extract(order, pixels, regions, settings, progress, send, staging)
@@ -326,7 +327,7 @@ def _extract(order, pixels, regions, settings, progress, send, staging):
     return made, cancelled
 
 
-def _nearest(mask, shape):
+def nearest(mask, shape):
     """`mask` at `shape` (H, W): a huge photo is reduced when it is read from disk, its masks follow."""
     if mask.shape == shape:
         return mask

@@ -173,6 +173,8 @@ class OptionsPanel:
         column = layout.column()
         column.prop(settings, "seed")
         column.prop(settings, "flatten")
+        column.prop(settings, "white_balance")
+        layout.operator("material_palette.preview_exemplar", icon="IMAGE_BACKGROUND")
         column.prop(settings, "pack")
         if not settings.pack:
             column.prop(settings, "output_folder", text="Folder")

@@ -102,3 +102,13 @@ def test_of_a_huge_region_the_fullest_part_is_cut_and_said():
     exemplar = cut_exemplar(np.full((1700, 3200, 3), 0.4, np.float32), mask)
     assert exemplar.mask.shape == (1536, 1536) and exemplar.mask.all()
     assert any("3151 x 1700" in warning for warning in exemplar.warnings)
+
+
+def test_white_balance_makes_the_regions_mean_grey_and_nothing_else():
+    grey = linear_from_srgb(0.2 + 0.5 * pebbles(160, 160)).mean(-1, keepdims=True)
+    tungsten = np.float32([1.25, 1.0, 0.55])
+    photo = (grey * tungsten).astype(np.float32)
+    off, region = (cut_exemplar(photo, full(photo), white_balance=mode) for mode in ("off", "region"))
+    assert np.ptp(off.pixels[off.mask].mean(0)) > 0.05
+    assert np.ptp(region.pixels[region.mask].mean(0)) < 0.002
+    assert np.allclose(region.pixels * region.shading, photo, rtol=1e-4)

@@ -76,6 +76,16 @@ def test_files_are_those_of_the_record_and_every_map_tiles(palette, written):
     assert sorted(p.name for p in (folder / "masks").iterdir()) == ["gravel.png", "paint.png", "speck.png"]
 
 
+def test_what_a_material_was_learnt_from_is_written(palette, written):
+    folder, content = written
+    for material, record in zip(palette.materials[:2], content["materials"], strict=False):
+        assert record["exemplar"] == f"exemplars/{material.name}.png"
+        picture = cv2.imread(str(folder / record["exemplar"]))[..., ::-1]
+        assert np.array_equal(picture, material.exemplar)
+    assert content["materials"][2]["exemplar"] is None
+    assert np.abs(palette.materials[0].exemplar.mean() / 255 - pebbles(160, 320)[5:150, 5:190].mean()) < 0.05
+
+
 def test_files_hold_the_maps(palette, written):
     folder, content = written
     svbrdf, maps = palette.materials[0].svbrdf, content["materials"][0]["maps"]
@@ -143,6 +153,7 @@ def test_cancelling_takes_half_a_second_at_most():
         ({"resolution": 0}, "resolution 0"),
         ({"resolution": 9000}, "64 to 8192"),
         ({"seed": -1}, "seed -1"),
+        ({"white_balance": "warm"}, "white balance 'warm'"),
         ({"metres_per_tile": float("nan")}, "metres per tile"),
     ],
 )

@@ -89,6 +89,7 @@ def test_choices_are_those_of_the_pipeline(extension):
     assert {identifier for identifier, *_ in properties.ENGINES} == set(engines.ENGINES)
 
     assert tuple(identifier for identifier, *_ in properties.QUALITIES) == tuple(palette.QUALITIES)
+    assert tuple(identifier for identifier, *_ in properties.WHITE_BALANCES) == palette.WHITE_BALANCES
     assert tuple(properties.RESOLUTION_RANGE) == tuple(palette.RESOLUTION_RANGE)
 
 

@@ -1,0 +1,61 @@
+"""Preview Exemplar: what a material would be learnt from, before any is extracted."""
+
+import bpy
+import numpy as np
+from bpy.types import Operator
+
+from ..core.errors import PaletteError
+from .background import BackgroundOperator
+from .extract import nearest
+from .photo import photo_reader
+from .regions import image_editor, read_mask_image
+
+NAME = "Exemplar"  # of the image; one is used again and again
+
+
+class MATERIAL_PALETTE_OT_preview_exemplar(BackgroundOperator, Operator):
+    """Show what the active region's material would be learnt from: flat, evenly lit, dark where it is left out"""
+
+    bl_idname = "material_palette.preview_exemplar"
+    bl_label = "Preview Exemplar"
+
+    def prepare(self, context):
+        settings = context.scene.material_palette
+        if settings.active_region >= len(settings.regions):
+            raise PaletteError("No region to preview: add and paint one")
+        region = settings.regions[settings.active_region]
+        if region.mask is not None and tuple(region.mask.size) != tuple(settings.photo.size):
+            raise PaletteError(f"Region '{region.name}': its mask isn't of the photo's size; paint it anew")
+        read, name, mask = photo_reader(settings.photo), region.name, read_mask_image(region)
+        chosen = {"flatten": settings.flatten, "white_balance": settings.white_balance}
+
+        def work(progress, send):
+            progress(0.0, "Reading the photo")
+            from ..core.palette import Settings, preview_exemplar
+            from ..core.region import Region
+
+            pixels, _warnings = read()
+            region = Region(name, nearest(mask, pixels.shape[:2]))
+            return preview_exemplar(pixels, region, Settings(**chosen), progress)
+
+        return work
+
+    def finish(self, context, scene, result):
+        picture, warnings = result
+        height, width = picture.shape[:2]
+        image = bpy.data.images.get(NAME)
+        if image is None or image.source != "GENERATED":
+            image = bpy.data.images.new(NAME, width, height)
+        elif tuple(image.size) != (width, height):
+            image.scale(width, height)
+        rgba = np.ones((height, width, 4), np.float32)
+        rgba[..., :3] = picture[::-1] / np.float32(255)
+        image.pixels.foreach_set(rgba.ravel())
+        image.update()
+        area = image_editor(context)
+        if area is not None:
+            area.spaces.active.image = image
+        self.report({"WARNING" if warnings else "INFO"}, "; ".join(warnings) or "Nothing is left out of this region")
+
+
+CLASSES = (MATERIAL_PALETTE_OT_preview_exemplar,)
