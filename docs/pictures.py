@@ -23,7 +23,7 @@ from material_palette.core.command import main  # noqa: E402
 
 SHEETS = {"viaduct": "demo", "facade": "facade"}
 SHOWN = [("viaduct", "masonry"), ("viaduct", "rubble"), ("facade", "stone_wall"), ("facade", "red_wood")]
-WINDOWS = {"4-picked": "window-regions", "7-palette": "window"}  # of tests/gui/artist.sh
+WINDOWS = {"4-picked": "window-regions", "9-assigned": "window"}  # of tests/gui/artist.sh
 REPEATS = 1.0  # of the tile along a wall
 
 

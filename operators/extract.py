@@ -78,7 +78,7 @@ class _Extracts(BackgroundOperator):
 
     def receive(self, context, scene, made):
         # what can't be built now, as when the files are on their way to their folder, is built or named at the end
-        with contextlib.suppress(PaletteError, RuntimeError):
+        with contextlib.suppress(Exception):
             self._take(scene.material_palette, made)
 
     def _take(self, settings, made):

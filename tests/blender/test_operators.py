@@ -332,7 +332,7 @@ def test_a_failed_run_leaves_nothing(ready, monkeypatch, data_blocks, temporary_
 def test_a_failing_build_is_named_and_leaves_the_others(ready, instant, monkeypatch, capfd, temporary_folders):
     from material_palette.core import nodes
 
-    def mark_asset(material, description):
+    def mark_asset(material, *_told):
         if material.name == "right":
             raise PaletteError("no asset")
 

@@ -41,7 +41,7 @@ def begin():
         bpy.data.objects["Cube"].location.x = 1.0
         bpy.ops.ed.undo_push(message="Move")
         assert bpy.ops.material_palette.extract("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
-    yield from wait(lambda: run().progress > 0, 60)
+    yield from wait(lambda: run().progress > 0, 240)
 
 
 def wait(condition, seconds):
