@@ -38,6 +38,7 @@ if "material_palette" not in sys.modules:
 
     dev.load_package()
 from material_palette.core import brdf, decomposition  # noqa: E402
+from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.exemplar import LUMINANCE  # noqa: E402
 from material_palette.core.image import linear_from_srgb, srgb_from_linear  # noqa: E402
 from material_palette.core.material import SVBRDF  # noqa: E402
@@ -275,41 +276,26 @@ def luminance_normal(texture: np.ndarray, strength: float) -> np.ndarray:
     return normal_from_height(blur(luminance, 1.0) * (strength / texture.shape[1])).numpy()
 
 
-def analytic(prior: Prior, weights: Path | None) -> Decompose:
-    module = getattr(decomposition, "analytic", decomposition)
-    return lambda texture: module.decompose(texture, _quiet)
-
-
-def named(name: str) -> Callable:
+def product(name: str) -> Callable:
     """A decomposer of the product, with its own weights or with those of a file."""
 
     def row(prior: Prior, weights: Path | None) -> Decompose:
-        decomposers = getattr(decomposition, "DECOMPOSERS", {})
-        if name not in decomposers:
-            raise SystemExit(f"there is no decomposer '{name}'; there are: {', '.join(decomposers) or 'none by name'}")
-        if weights is None:
-            return lambda texture: decomposers[name](texture, _quiet)
-        return lambda texture: decomposers[name](texture, _quiet, weights)
+        try:
+            chosen = decomposition.choose(name if weights is None else f"{name}={weights}")
+        except PaletteError as error:
+            raise SystemExit(str(error)) from error
+        return lambda texture: chosen(texture, _quiet)
 
     return row
-
-
-def published(prior: Prior, weights: Path | None) -> Decompose:
-    """The network of the paper's authors, with their checkpoint."""
-    from material_palette.models import resnet101
-
-    if weights is None:
-        raise SystemExit("resnet101 needs the authors' checkpoint: --rows resnet101=model.ckpt")
-    return lambda texture: resnet101.decompose(texture, _quiet, weights)
 
 
 ROWS = {
     "constant prior": constant_prior,
     "nothing": nothing,
     "luminance-to-normal": luminance_to_normal,
-    "analytic": analytic,
-    "unet": named("unet"),
-    "resnet101": published,
+    "analytic": product("analytic"),
+    "unet": product("unet"),
+    "resnet101": product("resnet101"),
 }
 DEFAULT = tuple(name for name in ROWS if name != "resnet101")
 LABELS = {"nothing": "photo as albedo, flat"}

@@ -62,7 +62,9 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto")
     extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
     extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
-    extract.add_argument("--decomposer", default="unet", help="unet (a network) or analytic (%(default)s)")
+    extract.add_argument(
+        "--decomposer", default="unet", help="unet (a network), analytic, or resnet101=FILE (%(default)s)"
+    )
     extract.add_argument("--quality", default="balanced", help="draft, balanced or best (%(default)s)")
     extract.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
     extract.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")

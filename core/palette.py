@@ -57,9 +57,7 @@ class Settings:
         """Raise PaletteError naming the first setting that cannot be honoured."""
         if self.engine not in engines.ENGINES:
             raise PaletteError(f"engine '{self.engine}' is unknown; choose one of: {', '.join(engines.ENGINES)}")
-        if self.decomposer not in decomposition.DECOMPOSERS:
-            known = ", ".join(decomposition.DECOMPOSERS)
-            raise PaletteError(f"decomposer '{self.decomposer}' is unknown; choose one of: {known}")
+        decomposition.choose(self.decomposer)
         if self.quality not in QUALITIES:
             raise PaletteError(f"quality '{self.quality}' is unknown; choose one of: {', '.join(QUALITIES)}")
         least, most = RESOLUTION_RANGE

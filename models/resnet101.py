@@ -15,6 +15,7 @@ Neither weights nor code of the authors are included.
 import pickle
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -65,9 +66,9 @@ class Encoder(nn.Module):
         super().__init__()
         self.conv1 = wrapped(3, 64, 7, 2)
         channels = 64
-        for i, count in enumerate(BLOCKS):
+        for i, depth in enumerate(BLOCKS):
             blocks = []
-            for k in range(count):
+            for k in range(depth):
                 blocks.append(Bottleneck(channels, 64 << i, 2 if i and not k else 1))
                 channels = 256 << i
             self.add_module(f"layer{i + 1}", nn.Sequential(*blocks))
@@ -188,8 +189,19 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weigh
     ends = [-(-(side + 2 * m) // STRIDE) * STRIDE - m for side, m in zip((height, width), margins, strict=True)]
     rows, columns = (np.arange(-m, end) for m, end in zip(margins, ends, strict=True))
     pixels = torch.from_numpy(encoded[(rows % height)[:, None], (columns % width)[None]])
-    with torch.inference_mode():
-        out = net(pixels.permute(2, 0, 1)[None].contiguous())
+    convolutions = [module for module in net.modules() if isinstance(module, nn.Conv2d)]
+    done = count()
+
+    def tick(*_):
+        progress(0.8 * next(done) / len(convolutions), "decomposing")
+
+    hooks = [module.register_forward_pre_hook(tick) for module in convolutions]
+    try:
+        with torch.inference_mode():
+            out = net(pixels.permute(2, 0, 1)[None].contiguous())
+    finally:
+        for hook in hooks:
+            hook.remove()
     albedo, normal, roughness = (
         out[name][0, :, margins[0] : margins[0] + height, margins[1] : margins[1] + width].permute(1, 2, 0).clone()
         for name in ("albedo", "normals", "roughness")

@@ -87,6 +87,18 @@ def test_an_unknown_decomposer_is_named():
         decompose(np.zeros((32, 32, 3), np.float32), quiet, "nonsense")
 
 
+def test_weights_come_from_the_file_that_is_named(tmp_path):
+    with pytest.raises(PaletteError, match="resnet101=FILE"):
+        decompose(np.zeros((32, 32, 3), np.float32), quiet, "resnet101")
+    with pytest.raises(PaletteError, match="none at .*missing.ckpt"):
+        decompose(np.zeros((32, 32, 3), np.float32), quiet, f"resnet101={tmp_path / 'missing.ckpt'}")
+    with pytest.raises(PaletteError, match="unknown"):
+        decompose(np.zeros((32, 32, 3), np.float32), quiet, f"analytic={unet.WEIGHTS}")
+    texture = np.repeat(tileable_noise(64, 64)[..., None], 3, -1).astype(np.float32)
+    named, shipped = (decompose(texture, quiet, d) for d in (f"unet={unet.WEIGHTS}", "unet"))
+    assert np.array_equal(named.normal, shipped.normal)
+
+
 def test_tiles_give_what_one_pass_gives(monkeypatch):
     shades = tileable_noise(640, 640)
     texture = (0.1 + 0.5 * np.stack([shades, shades**2, shades], -1)).astype(np.float32)

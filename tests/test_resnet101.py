@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from material_palette.core.decomposition import decompose
 from material_palette.core.errors import PaletteError
 from material_palette.core.tensors import write_tensors
 from material_palette.core.torus import WRAP_GATE, wrap_ratio
@@ -63,6 +64,22 @@ def test_maps_tile_and_follow_the_texture(checkpoint):
         assert wrap_ratio(value) <= WRAP_GATE, name
         assert np.abs(getattr(rolled, name) - np.roll(value, (32, -64), (0, 1))).max() < 1 / 255, name
     assert np.allclose(np.linalg.norm(maps.normal, axis=-1), 1, atol=1e-5)
+
+
+def test_cancelling_ends_it(checkpoint):
+    class Stop(Exception):
+        pass
+
+    def stop(fraction, message):
+        if fraction > 0.1:
+            raise Stop
+
+    with pytest.raises(Stop):
+        decompose(texture(64, 64), stop, f"resnet101={checkpoint}")
+    # and nothing of it is left in the network
+    seen = []
+    decompose(texture(64, 64), lambda fraction, message: seen.append(fraction), f"resnet101={checkpoint}")
+    assert seen == sorted(seen) and seen[-1] == 1.0
 
 
 def test_any_size_will_do(checkpoint):

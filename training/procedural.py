@@ -1109,15 +1109,18 @@ def material(seed: int, size: int = 256, family: str | None = None) -> SVBRDF:
     # fine relief that no family lacks, and change of colour without any relief
     s.height = s.height + s.height.std() * c.log_uniform(0.002, 0.04) * c.noise(size / 6, None, 0.3)
     _age(c, s)
-    if c.chance(0.5):
-        s.colour = s.colour * np.exp(c.log_uniform(0.01, 0.12) * c.noise(1.5, None, c.uniform(0.4, 1.3)))[..., None]
+    if c.chance(0.7):
+        grain = c.noise(c.log_uniform(1.5, size / 6), None, c.uniform(0.1, 1.1))
+        s.colour = s.colour * np.exp(c.log_uniform(0.01, 0.15) * grain)[..., None]
+    if c.chance(0.3):  # greyer
+        s.colour = mix(s.colour, s.colour.mean(-1, keepdims=True), np.full((size, size), c.uniform(0.3, 1.0)))
 
     # what must not be taken for granted
     if c.chance(0.1):
         s.colour = np.broadcast_to(s.colour.mean((0, 1)), s.colour.shape)
-    elif c.chance(0.15):
+    elif c.chance(0.5):
         mean = s.colour.mean((0, 1))
-        s.colour = mean + (s.colour - mean) * c.uniform(0.1, 0.6)
+        s.colour = mean + (s.colour - mean) * c.uniform(0.2, 0.9)
     albedo = np.clip(linear_from_srgb(np.clip(s.colour, 0.02, 0.985).astype(np.float32)), 0, 1)
     low, high = s.slope
     slope = c.log_uniform(low, high)

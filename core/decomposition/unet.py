@@ -29,9 +29,9 @@ STEEPEST = 4.0
 DARKEST = 1e-3  # linear, as in training
 
 
-def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SVBRDF:
+def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weights: Path = WEIGHTS) -> SVBRDF:
     """See `core.decomposition.decompose`. Peak memory beyond the maps: about 0.3 GB a thread."""
-    net = _network()
+    net = load(weights)
     progress(0.0, "recognising the material")
     origin = _origin(texture)
     texture = np.roll(texture, (-origin[0], -origin[1]), (0, 1))
@@ -53,10 +53,6 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SV
 
 
 @cache
-def _network() -> SvbrdfNet:
-    return load(WEIGHTS)
-
-
 def load(path: Path) -> SvbrdfNet:
     """The network with the weights of a safetensors file; PaletteError where they are not this network's."""
     tensors, _ = read_tensors(path)
