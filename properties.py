@@ -27,6 +27,11 @@ WHITE_BALANCES = (
     ("off", "As in the Photo", "Keep the photo's own white balance"),
     ("region", "Grey on Average", "Take the light's colour from the region: for plaster, concrete and other greys"),
 )
+RECTIFY = (
+    ("auto", "Automatic", "Bring a slanted region to the front, by its corners or by the plane that is found"),
+    ("quad", "Corners Only", "Bring only regions with corners to the front"),
+    ("off", "Off", "Take every region as the photo shows it"),
+)
 RESOLUTION_RANGE = (64, 8192)
 # Paths that start with "//"; from Blender 4.5 on a property has to say that it takes them.
 _BLEND_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
@@ -146,6 +151,24 @@ class MATERIAL_PALETTE_PG_region(PropertyGroup):
         description="Colour of the region over the photo",
     )
     enabled: BoolProperty(name="Extract", default=True, description="Extract a material from this region")
+    corners: FloatVectorProperty(
+        name="Corners",
+        size=8,
+        description="A rectangle on the surface: x and y of four points in px of the photo, clockwise from top left",
+    )
+    has_corners: BoolProperty(name="Corners Set", description="Rectify this region by its corners")
+    measured: FloatVectorProperty(
+        name="Measured", size=4, description="x and y of two points on the surface in px of the photo"
+    )
+    has_measure: BoolProperty(name="Measured", description="The size of this region's tile follows from its measure")
+    measured_length: FloatProperty(
+        name="Length",
+        default=1.0,
+        min=0.0001,
+        soft_max=100.0,
+        unit="LENGTH",
+        description="Length of what was measured on the surface",
+    )
     visible: BoolProperty(name="Visible", default=True, description="Show the region over the photo")
     error: StringProperty(name="Error", description="Why no material could be made of the region the last time")
     automatic: BoolProperty(
@@ -195,6 +218,14 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         soft_max=100.0,
         unit="LENGTH",
         description="How wide one tile of the texture is on a surface whose UV map is in metres",
+    )
+    rectify: EnumProperty(name="Rectify", items=RECTIFY, default="auto", description="How slanted regions are treated")
+    focal_length: FloatProperty(
+        name="Focal Length",
+        min=0.0,
+        soft_max=200.0,
+        unit="CAMERA",
+        description="Of the photo's camera, for a sensor 36 mm wide on its longer side; 0: from the photo, or found",
     )
     flatten: BoolProperty(
         name="Flatten Light", default=True, description="Take slow changes of light and cast shadows out of the photo"

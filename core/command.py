@@ -156,12 +156,15 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         start = time.perf_counter()
         if masks is not None:
             shape = photo.pixels.shape[:2]
-            regions = read_annotations(masks, shape, photo_path.name) if masks.is_file() else read_regions(masks, shape)
+            if masks.is_file():
+                regions = read_annotations(masks, shape, photo_path.name)
+            else:
+                regions = read_regions(masks, shape, photo.scale)
         else:
             from .segmentation import segment
 
             regions = segment(photo.pixels, arguments.segment, arguments.regions, settings.seed, line.progress)
-        add_geometry(regions, corners, measures)
+        add_geometry(regions, corners, measures, photo.scale)
         seconds["regions"] = time.perf_counter() - start
 
         def on_material(material: Material) -> None:
@@ -176,6 +179,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
             photo.pixels, regions, settings, line.progress, on_material, photo_path.name, photo.focal
         )
         palette.warnings[:0] = photo.warnings
+        palette.scale = photo.scale
         palette.seconds = seconds | palette.seconds
         failed = [material for material in palette.materials if material.error]
         if len(failed) == len(regions):

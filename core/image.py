@@ -45,12 +45,14 @@ BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.03
 class Photo:
     """pixels (H, W, 3) float32 linear Rec.709, >= 0, upright; warnings: what was changed on the way in.
 
-    focal: focal length in px of `pixels`, as the camera wrote it into the file, else None.
+    focal: focal length in px of `pixels`, as the camera wrote it into the file, else None; scale: px of `pixels` per px
+    of the file.
     """
 
     pixels: np.ndarray
     warnings: list[str] = field(default_factory=list)
     focal: float | None = None
+    scale: float = 1.0
 
 
 def linear_from_srgb(x: np.ndarray) -> np.ndarray:
@@ -117,7 +119,7 @@ def read_photo(
         orientation = spec.get_int_attribute("Orientation", 1)
         upright = _upright(pixels, orientation)
         total = spec.width * spec.height
-        focal = _focal(spec, max(height, width))
+        focal = _focal(spec)
     if transparent:
         warnings.append(
             f"{100 * transparent / total:.3g} % of the photo is transparent: the colour stored there is used where a "
@@ -133,7 +135,7 @@ def read_photo(
             f"The photo was reduced from {large[0]} x {large[1]} px to {upright.shape[1]} x {upright.shape[0]} px: "
             f"at most {max_pixels / 1e6:g} megapixels are used."
         )
-    return Photo(upright, warnings, focal)
+    return Photo(upright, warnings, focal and focal * max(height, width), width / spec.width)
 
 
 def read_mask(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
@@ -318,9 +320,19 @@ def _stored_model(spec: "oiio.ImageSpec") -> str:
     return (spec.get_string_attribute("jpeg:ColorSpace") or spec.get_string_attribute("tiff:ColorSpace")).upper()
 
 
-def _focal(spec: "oiio.ImageSpec", longer: int) -> float | None:
-    """Focal length in px of a picture with so many px on its longer side, from EXIF, None where it is not told."""
+def read_focal(path: str | Path) -> float | None:
+    """The focal length that a camera wrote into a photo's file, in longer sides of the photo, else None."""
+    image = oiio.ImageInput.open(str(path))
+    if image is None:
+        oiio.geterror()
+        return None
+    try:
+        return _focal(image.spec())
+    finally:
+        image.close()
 
+
+def _focal(spec: "oiio.ImageSpec") -> float | None:
     def exif(name: str) -> float:
         value = spec.getattribute(f"Exif:{name}")
         return float(value) if isinstance(value, int | float) and 0 < value < 1e6 else 0.0
@@ -328,10 +340,10 @@ def _focal(spec: "oiio.ImageSpec", longer: int) -> float | None:
     # by CIPA's definition the equivalent for 35 mm film goes by the diagonal
     if exif("FocalLengthIn35mmFilm"):
         diagonal = float(np.hypot(spec.width, spec.height)) / max(spec.width, spec.height)
-        return exif("FocalLengthIn35mmFilm") / FILM_DIAGONAL * diagonal * longer
+        return exif("FocalLengthIn35mmFilm") / FILM_DIAGONAL * diagonal
     unit = {2: 25.4, 3: 10.0}.get(int(exif("FocalPlaneResolutionUnit")), 25.4)
     across = exif("PixelXDimension") or spec.width
-    return (exif("FocalLength") * exif("FocalPlaneXResolution") / unit / across * longer) or None
+    return (exif("FocalLength") * exif("FocalPlaneXResolution") / unit / across) or None
 
 
 def _linearisation(spec: "oiio.ImageSpec", warnings: list[str]) -> Callable[[np.ndarray], np.ndarray]:

@@ -102,7 +102,10 @@ class Material:
 
 @dataclass
 class Palette:
-    """photo (H, W, 3) float32 linear, its regions and, in the same order, their materials."""
+    """photo (H, W, 3) float32 linear, its regions and, in the same order, their materials.
+
+    scale: px of the photo per px of its file.
+    """
 
     photo: np.ndarray
     photo_name: str
@@ -111,6 +114,7 @@ class Palette:
     materials: list[Material]
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    scale: float = 1.0
 
 
 def extract_palette(
@@ -324,7 +328,7 @@ def write_palette(
     (folder / "masks").mkdir()
     for region in palette.regions:
         write_image(folder / "masks" / f"{file_name(region.name)}.png", region.mask.astype(np.float32))
-    _write_geometry(palette.regions, folder / "masks")
+    _write_geometry(palette, folder / "masks")
     progress(0.85, "writing the contact sheet")
     write_image(folder / "palette.png", sheet.contact_sheet(palette))
     seconds = palette.seconds | {"write": time.perf_counter() - start}
@@ -341,9 +345,9 @@ def write_palette(
     return content
 
 
-def _write_geometry(regions: list[Region], folder: Path) -> None:
+def _write_geometry(palette: Palette, folder: Path) -> None:
     """The regions' corners and measures beside their masks, as `region.read_regions` reads them."""
-    content = {region.name: geometry for region in regions if (geometry := region_geometry(region))}
+    content = {r.name: geometry for r in palette.regions if (geometry := region_geometry(r, palette.scale))}
     if content:
         _write_json(folder / GEOMETRY, content)
 

@@ -163,6 +163,35 @@ def plane_of_corners(
     return h, normal
 
 
+def corners_on_plane(right: np.ndarray, up: np.ndarray, focal: float, mask: np.ndarray) -> np.ndarray:
+    """Corners (4, 2) in photo px of a square on a surface, in the middle of a region, as `rectify_corners` takes them.
+
+    right and up (3,): directions on the surface, camera coordinates (x right, y down, z forward); mask (H, W) bool;
+    focal in px. Raises PaletteError for an empty region and a surface that is seen edge on or lies behind the camera.
+    """
+    if not mask.any():
+        raise PaletteError("the region is empty; paint it first")
+    centre, where = _principal_point(mask.shape), _centroid(mask)
+    to_photo, normal = plane_of_camera(np.cross(right, up), focal, centre, where)
+    axes = plane_axes(normal[:2] / normal[2])
+    along = axes @ right / np.linalg.norm(right)
+    along /= np.linalg.norm(along)
+    across = np.array([-along[1], along[0]])
+    # of the four turns of the square, the one that stands upright in the photo
+    if abs(along[0]) < abs(along[1]):
+        along, across = -across, along
+    along, across = along * np.sign(along[0]), across * np.sign(along[0])
+    density, _ = _density(np.linalg.inv(to_photo), np.array([where]))
+    half = 0.25 * np.sqrt(mask.sum()) / density[0]
+    for _ in range(20):
+        square = np.array([-along - across, along - across, along + across, -along + across]) * half
+        bottom = _denominator(to_photo, square)
+        if bottom.min() > 0.3 * _denominator(to_photo, np.zeros((1, 2)))[0]:
+            return _mapped(to_photo, square)
+        half *= 0.7
+    raise PaletteError("the surface is seen edge on; nothing of it can be rectified")
+
+
 def plane_of_camera(
     normal: np.ndarray, focal: float, centre: tuple[float, float], where: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:

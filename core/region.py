@@ -37,10 +37,11 @@ class Region:
     measure: tuple[np.ndarray, float] | None = None
 
 
-def read_regions(folder: str | Path, shape: tuple[int, int]) -> list[Region]:
+def read_regions(folder: str | Path, shape: tuple[int, int], scale: float = 1.0) -> list[Region]:
     """One region per mask image in `folder`, named as its file without suffix, sorted by name, of the shape (H, W).
 
-    Corners and measures come from the file GEOMETRY beside them, if there is one. Hidden files, folders and other files
+    Corners and measures come from the file GEOMETRY beside them, if there is one, in px of the photo's file, of which
+    the photo has `scale`. Hidden files, folders and other files
     without an image's suffix are passed over.
     Raises PaletteError for a folder that is missing or holds no mask, for two masks whose files of maps would have one
     name on some system, and for what `read_mask` refuses.
@@ -69,7 +70,7 @@ def read_regions(folder: str | Path, shape: tuple[int, int]) -> list[Region]:
             )
     regions = [Region(_readable(file.stem), read_mask(file, shape)) for file in files]
     if (folder / GEOMETRY).is_file():
-        _read_geometry(folder / GEOMETRY, regions)
+        _read_geometry(folder / GEOMETRY, regions, scale)
     return regions
 
 
@@ -87,30 +88,33 @@ def parse_measure(text: str) -> tuple[str, tuple[np.ndarray, float]]:
     return _readable(name), (_points(points.split(), 2, text, usage), _metres(metres, text, usage))
 
 
-def add_geometry(regions: list[Region], corners: dict, measures: dict) -> None:
-    """Give regions their corners and measures, by name. Raises PaletteError for a name that no region has."""
+def add_geometry(regions: list[Region], corners: dict, measures: dict, scale: float = 1.0) -> None:
+    """Give regions their corners and measures, by name, in px of a photo `scale` times smaller than its file.
+
+    Raises PaletteError for a name that no region has.
+    """
     by_name = {region.name: region for region in regions}
     for name in [*corners, *measures]:
         if name not in by_name:
             raise PaletteError(f"there is no region '{name}'; choose one of: {', '.join(by_name)}")
     for name, found in corners.items():
-        by_name[name].corners = found
-    for name, found in measures.items():
-        by_name[name].measure = found
+        by_name[name].corners = found * scale
+    for name, (points, metres) in measures.items():
+        by_name[name].measure = points * scale, metres
 
 
-def region_geometry(region: Region) -> dict:
-    """A region's corners and measure as `GEOMETRY` holds them; empty without either."""
+def region_geometry(region: Region, scale: float = 1.0) -> dict:
+    """A region's corners and measure as `GEOMETRY` holds them, in px of the file; empty without either."""
     found = {}
     if region.corners is not None:
-        found["corners"] = np.asarray(region.corners, float).tolist()
+        found["corners"] = (np.asarray(region.corners, float) / scale).tolist()
     if region.measure is not None:
         points, metres = region.measure
-        found["measure"] = {"points": np.asarray(points, float).tolist(), "metres": metres}
+        found["measure"] = {"points": (np.asarray(points, float) / scale).tolist(), "metres": metres}
     return found
 
 
-def _read_geometry(file: Path, regions: list[Region]) -> None:
+def _read_geometry(file: Path, regions: list[Region], scale: float) -> None:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         corners = {n: g["corners"] for n, g in content.items() if "corners" in g}
@@ -118,7 +122,7 @@ def _read_geometry(file: Path, regions: list[Region]) -> None:
         usage = "points [x, y], four as corners and two as a measure"
         corners = {n: _points(c, 4, str(c), usage) for n, c in corners.items()}
         measures = {n: (_points(p, 2, str(p), usage), _metres(m, str(m), "a length")) for n, (p, m) in measures.items()}
-        add_geometry(regions, corners, measures)
+        add_geometry(regions, corners, measures, scale)
     except PaletteError as error:
         raise PaletteError(f"'{file}': {error}") from None
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

@@ -16,8 +16,9 @@ from ..core.errors import Abandoned, Cancelled, PaletteError
 from . import history
 from .background import BackgroundOperator
 from .palette import active_entry, put_in_palette, region_of
-from .photo import photo_reader
+from .photo import photo_focal, photo_reader
 from .preferences import diffusion_settings
+from .rectify import corners_of, measure_of
 from .regions import read_mask_image
 
 _EXTRACTION = 0.95  # share of the time; the rest is writing
@@ -56,6 +57,9 @@ class _Order:
     folder: Path | None
     overwrite: bool
     temporary: str | None
+    geometry: dict  # by region name: corners and measure, in px of a photo of `size`
+    size: tuple
+    focal: float | None  # in longer sides of the photo
     diffusion: dict = field(default_factory=dict)  # settings of that engine
     warnings: list = field(default_factory=list)
 
@@ -197,6 +201,7 @@ def _read_order(settings, regions, seed, is_whole):
         "quality": settings.quality,
         "resolution": settings.resolution,
         "seed": seed,
+        "rectify": settings.rectify,
         "flatten": settings.flatten,
         "white_balance": settings.white_balance,
         "metres_per_tile": settings.metres_per_tile,
@@ -213,6 +218,9 @@ def _read_order(settings, regions, seed, is_whole):
         overwrite=False,
         temporary=bpy.app.tempdir,
         diffusion=diffusion_settings(bpy.context),
+        geometry={region.name: (corners_of(region), measure_of(region)) for region in regions},
+        size=tuple(settings.photo.size),
+        focal=settings.focal_length / 36.0 or photo_focal(settings.photo),
     )
     if not settings.pack:
         order.folder, order.overwrite = _output_folder(settings), settings.overwrite and is_whole
@@ -265,14 +273,17 @@ def _work(order, progress, send):
     from ..core.engines.diffusion import DiffusionSettings
     from ..core.output import staged
     from ..core.palette import Settings
-    from ..core.region import Region
+    from ..core.region import Region, add_geometry
 
     diffusion = DiffusionSettings(**order.diffusion) if order.chosen["engine"] == "diffusion" else None
     settings = Settings(**order.chosen, diffusion=diffusion)
     settings.check()
     progress(0.0, "Reading the photo")
     pixels, order.warnings = order.read()
-    regions = [Region(name, nearest(mask, pixels.shape[:2])) for name, mask in order.masks.items()]
+    shape, scale = pixels.shape[:2], pixels.shape[1] / order.size[0]
+    regions = [Region(name, nearest(mask, shape)) for name, mask in order.masks.items()]
+    for region in regions:
+        add_geometry([region], *({region.name: g} if g is not None else {} for g in order.geometry[region.name]), scale)
     place = staged(order.folder, order.overwrite) if order.folder else _temporary(order.temporary)
     with place as staging:
         made, cancelled = _extract(order, pixels, regions, settings, progress, send, staging)
@@ -308,7 +319,15 @@ def _extract(order, pixels, regions, settings, progress, send, staging):
 
     cancelled = False
     try:
-        palette = extract_palette(pixels, regions, settings, extracting, on_material, order.photo_name)
+        palette = extract_palette(
+            pixels,
+            regions,
+            settings,
+            extracting,
+            on_material,
+            order.photo_name,
+            order.focal and order.focal * max(pixels.shape),
+        )
     except Abandoned:
         raise
     except Cancelled:

@@ -46,6 +46,14 @@ def take_photo(context, image):
     settings.photo = image
 
 
+def photo_focal(image):
+    """The focal length that the camera wrote into the photo's file, in longer sides of the photo, else None."""
+    from ..core.image import read_focal
+
+    path = bpy.path.abspath(image.filepath_raw, library=image.library)
+    return read_focal(path) if image.source == "FILE" and os.path.isfile(path) else None
+
+
 def _file_reader(path):
     def read():
         from ..core.image import read_photo

@@ -91,6 +91,8 @@ class RegionsPanel:
             _draw_painting(layout, settings)
         else:
             _draw_tools(layout, settings)
+            if settings.active_region < len(settings.regions):
+                _draw_surface(layout, settings.regions[settings.active_region])
         # last, so that no button moves away from under the mouse when a problem is found
         if settings.active_region < len(settings.regions):
             region = settings.regions[settings.active_region]
@@ -120,6 +122,20 @@ def _draw_painting(layout, settings):
     row.operator("material_palette.paint_region", text="Erase", icon="REMOVE").erase = True
     box.operator("material_palette.show_photo", text="Done", icon="CHECKMARK")
     box.label(text="Ctrl does the opposite", icon="INFO")
+
+
+def _draw_surface(layout, region):
+    """How the region's surface lies, and how large it is."""
+    row = layout.row(align=True)
+    row.operator("material_palette.corners", text="Corners", icon="MOD_LATTICE", depress=region.has_corners)
+    row.operator("material_palette.corners_from_camera", text="", icon="CAMERA_DATA")
+    if region.has_corners:
+        row.operator("material_palette.clear_corners", text="", icon="X")
+    row = layout.row(align=True)
+    row.operator("material_palette.measure", text="Measure", icon="DRIVER_DISTANCE", depress=region.has_measure)
+    if region.has_measure:
+        row.prop(region, "measured_length", text="")
+        row.operator("material_palette.clear_measure", text="", icon="X")
 
 
 class ExtractPanel:
@@ -172,6 +188,8 @@ class OptionsPanel:
         layout.active = not context.window_manager.material_palette_run.running
         column = layout.column()
         column.prop(settings, "seed")
+        column.prop(settings, "rectify")
+        column.prop(settings, "focal_length")
         column.prop(settings, "flatten")
         column.prop(settings, "white_balance")
         layout.operator("material_palette.preview_exemplar", icon="IMAGE_BACKGROUND")

@@ -161,7 +161,7 @@ def test_the_focal_length_is_read_from_exif(tmp_path):
     import OpenImageIO as oiio
 
     spec = oiio.ImageSpec(360, 240, 3, "uint8")
-    spec.attribute("Exif:FocalLengthIn35mmFilm", oiio.TypeDesc("uint16"), 50)
+    spec.attribute("Exif:FocalLengthIn35mmFilm", 50)
     file = oiio.ImageOutput.create("photo.jpg")
     assert file.open(str(tmp_path / "photo.jpg"), spec)
     file.write_image(np.zeros((240, 360, 3), np.uint8))
