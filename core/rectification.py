@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from .errors import PaletteError
-from .exemplar import LARGEST, LUMINANCE
+from .exemplar import CLIPPED, LARGEST, LUMINANCE
 from .image import srgb_from_linear
 from .texture_gradient import gradient_scores, local_spectra, plane_axes
 from .vanishing import Segments, find_focal, find_frame, find_segments, line_score
@@ -227,7 +227,8 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     scale = min(1.0, LOOKED_AT / float(mask.sum()) ** 0.5)
     size = max(1, round((box[1].stop - box[1].start) * scale)), max(1, round((box[0].stop - box[0].start) * scale))
     grey = cv2.resize(np.ascontiguousarray(pixels[box] @ LUMINANCE), size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(mask[box].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    seen = mask[box] & (pixels[box] < CLIPPED).any(-1)
+    small = cv2.resize(seen.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     centre = np.array(_principal_point(mask.shape))
     own = ((centre - (box[1].start, box[0].start)) + 0.5) * scale - 0.5
     spectra = local_spectra(np.log(grey + DARKEST), small, view.focal * scale, tuple(own))
@@ -257,7 +258,8 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
         "margin": float(scores[best, 0] - scores[away > 20, 0].max()) if (away > 20).any() else 1.0,
         "windows": len(spectra.at),
         "lines": len(segments.ends),
-        "level": float(scores[0, 0]),
+        "agreement": float(scores[best, 0]),
+        "range": float(np.log(1 + spectra.at @ planes[best]).std()),
     }
     return PlaneEstimate(planes[best], _confidence(evidence), evidence)
 
