@@ -19,8 +19,11 @@ from .vanishing import Segments, find_focal, find_frame, find_segments, line_sco
 MODES = ("off", "auto", "quad")
 DEFAULT_FOCAL = 1.0  # in longer sides of the photo: 53 degrees, between a telephone's camera and a normal lens
 LOOKED_AT = 512  # px: side of the square with the region's area when its plane is sought
+LEAST_GAIN, LEAST_MARGIN, POOR_MARGIN, MARGIN_SHARE = 0.04, 0.05, 0.15, 0.25  # of the score, see `_confidence`
+MOST_SPREAD, FAR = 5.0, 20.0  # degrees
 LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
-STEEPEST = 80.0  # degrees
+LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middle of its region: 82 degrees
+AXIS = np.array([0.0, 0.0, 1.0])
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
 ENOUGH_LINES = 100
 LEAST_CONFIDENCE = 0.5
@@ -72,15 +75,15 @@ class Rectification:
 
 @dataclass
 class PlaneEstimate:
-    """gradient (2,): the plane has the inverse depth 1 + g.x over normalised image coordinates; confidence 0 to 1."""
+    """normal (3,): unit, away from the camera; confidence 0 to 1; evidence as `_confidence` takes it."""
 
-    gradient: np.ndarray
+    normal: np.ndarray
     confidence: float
     evidence: dict[str, float]
 
     @property
     def slant(self) -> float:
-        return float(np.degrees(np.arctan(np.linalg.norm(self.gradient))))
+        return _between(self.normal, AXIS)
 
 
 def look(pixels: np.ndarray, focal: float | None = None) -> View:
@@ -112,15 +115,15 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     seen from the front, or of which nothing certain is found, is returned as it is.
     """
     estimate = find_plane(pixels, mask, view)
+    if estimate is not None and estimate.slant < LEAST_SLANT:
+        return Rectification(pixels, mask, normal=-estimate.normal, confidence=estimate.confidence)
     if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
-        warning = "the slant of the region could not be told; it is used as the photo shows it"
+        warning = "the slant of the region could not be told for certain; it is used as the photo shows it"
         return Rectification(pixels, mask, confidence=estimate.confidence if estimate else 0.0, warnings=[warning])
-    if estimate.slant < LEAST_SLANT:
-        return Rectification(pixels, mask, normal=_normal(estimate.gradient), confidence=estimate.confidence)
     where = np.array(_centroid(mask))
-    to_photo = plane_to_photo(estimate.gradient, view.focal, _principal_point(mask.shape), where)
+    to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
     turn = _turn(view.segments.within(mask), to_photo)
-    return resample(pixels, mask, to_photo @ turn, "auto", _normal(estimate.gradient), estimate.confidence)
+    return resample(pixels, mask, to_photo @ turn, "auto", -estimate.normal, estimate.confidence)
 
 
 # ---------------------------------------------------------------- the plane
@@ -173,7 +176,7 @@ def corners_on_plane(right: np.ndarray, up: np.ndarray, focal: float, mask: np.n
         raise PaletteError("the region is empty; paint it first")
     centre, where = _principal_point(mask.shape), _centroid(mask)
     to_photo, normal = plane_of_camera(np.cross(right, up), focal, centre, where)
-    axes = plane_axes(normal[:2] / normal[2])
+    axes = plane_axes(-normal)
     along = axes @ right / np.linalg.norm(right)
     along /= np.linalg.norm(along)
     across = np.array([-along[1], along[0]])
@@ -203,21 +206,21 @@ def plane_of_camera(
     """
     normal = np.asarray(normal, np.float64) / np.linalg.norm(normal)
     ray = np.append((np.asarray(where, float) - centre) / focal, 1.0)
-    if abs(normal @ ray) < np.cos(np.radians(88)) * np.linalg.norm(ray) or abs(normal[2]) < 1e-3:
+    if abs(normal @ ray) < np.cos(np.radians(88)) * np.linalg.norm(ray):
         raise PaletteError("the surface is seen edge on; nothing of it can be rectified")
     normal = -normal * np.sign(normal @ ray)
-    return plane_to_photo(normal[:2] / normal[2], focal, centre, where), normal
+    return plane_to_photo(-normal, focal, centre, where), normal
 
 
-def plane_to_photo(gradient: np.ndarray, focal: float, centre: tuple[float, float], where) -> np.ndarray:
-    """Homography (3, 3) from the plane with inverse depth 1 + g.x, its origin at `where`, to photo px."""
-    gradient = np.asarray(gradient, np.float64)
+def plane_to_photo(normal: np.ndarray, focal: float, centre: tuple[float, float], where) -> np.ndarray:
+    """Homography (3, 3) from a plane, its origin at the photo px `where`, to photo px.
+
+    normal (3,): unit, away from the camera, camera coordinates; focal and principal point `centre` in photo px.
+    """
     ray = np.append((np.asarray(where, float) - centre) / focal, 1.0)
-    # the point of the plane, which lies at depth 1 on the axis, under `where`
-    origin = ray / (1 + gradient @ ray[:2])
-    h = np.column_stack([*plane_axes(gradient), origin / abs(origin[2])])
+    origin = ray / (normal @ ray)
     camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
-    return camera @ h
+    return camera @ np.column_stack([*plane_axes(normal), origin])
 
 
 def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimate | None:
@@ -238,88 +241,96 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     frame = find_frame(segments, view.focal, tuple(centre))
     if spectra is None:
         return None
-    starts = _starts()
-    if frame is not None and abs(frame.axes[2, 2]) > 0.15:
-        starts.append(frame.axes[2, :2] / frame.axes[2, 2])
+    ray = np.append(spectra.at.mean(0), 1.0)
+    ray /= np.linalg.norm(ray)
+    starts = _starts(ray)
+    if frame is not None:
+        normal = frame.axes[2] * np.sign(frame.axes[2] @ ray)
+        starts += [normal] if normal @ ray > LEAST_FACING else []
 
-    def score(gradient: np.ndarray) -> np.ndarray | None:
-        scores = gradient_scores(spectra, gradient)
+    def score(normal: np.ndarray) -> np.ndarray | None:
+        scores = gradient_scores(spectra, normal) if normal @ ray > LEAST_FACING else None
         if scores is None:
             return None
-        return scores + LINES_WEIGHT * enough * line_score(segments, gradient, view.focal, tuple(centre))
+        return scores + LINES_WEIGHT * enough * line_score(segments, normal, view.focal, tuple(centre))
 
     planes, scores = _search(score, starts)
     best = scores[:, 0].argmax()
-    away = np.array([_between(planes[best], g) for g in planes])
-    others = np.array([away[i] for i in scores[:, 1:].argmax(0)])
+    away = np.array([_between(planes[best], n) for n in planes])
+    others = away[scores[:, 1:].argmax(0)]
+    inverse_depth = spectra.at @ planes[best][:2] + planes[best][2]
     evidence = {
         "gain": float(scores[best, 0] - scores[0, 0]),
         "spread": float(np.sqrt((others**2).mean())),
-        "margin": float(scores[best, 0] - scores[away > 20, 0].max()) if (away > 20).any() else 1.0,
+        "margin": float(scores[best, 0] - scores[away > FAR, 0].max()) if (away > FAR).any() else 1.0,
+        "agreement": float(scores[best, 0]),
+        "range": float(np.log(inverse_depth).std()),
         "windows": len(spectra.at),
         "lines": len(segments.ends),
-        "agreement": float(scores[best, 0]),
-        "range": float(np.log(1 + spectra.at @ planes[best]).std()),
     }
     return PlaneEstimate(planes[best], _confidence(evidence), evidence)
 
 
 def _confidence(evidence: dict[str, float]) -> float:
-    return float(evidence["gain"] > 0.15 and evidence["spread"] < 8 and evidence["margin"] > 0.05)
+    """Of a slanted plane: 0.5 where the weakest of what speaks for it just suffices.
+
+    The plane has to explain more than the front does, clearly more than planes more than FAR degrees off, and with any
+    part of the region left out it has to stay about the same. Where even the best plane explains little, the texture is
+    not homogeneous and a difference counts for less. Thresholds chosen on training textures so that 1 in 100 is false.
+    """
+    margin = max(LEAST_MARGIN if evidence["agreement"] > 0 else POOR_MARGIN, MARGIN_SHARE * min(evidence["gain"], 0.4))
+    weakest = min(
+        evidence["gain"] / LEAST_GAIN, evidence["margin"] / margin, MOST_SPREAD / max(evidence["spread"], 0.1)
+    )
+    return float(1 / (1 + np.exp(-3 * np.log(max(weakest, 1e-6)))))
 
 
-def _starts() -> list[np.ndarray]:
-    """Gradients about 14 degrees apart, from the front on."""
-    found = [np.zeros(2)]
+def _starts(ray: np.ndarray) -> list[np.ndarray]:
+    """Normals about 14 degrees apart: that of the front, then in rings around a ray."""
+    right, down = plane_axes(ray)
+    found = [AXIS]
     for ring, (slant, count) in enumerate([(14, 8), (28, 12), (42, 14), (54, 16), (64, 16), (72, 16)]):
-        tilt = (np.arange(count) + 0.5 * (ring % 2)) * 2 * np.pi / count
-        found += list(np.tan(np.radians(slant)) * np.stack([np.cos(tilt), np.sin(tilt)], -1))
+        for tilt in (np.arange(count) + 0.5 * (ring % 2)) * 2 * np.pi / count:
+            c, s = np.cos(np.radians(slant)), np.sin(np.radians(slant))
+            found.append(c * ray + s * (np.cos(tilt) * right + np.sin(tilt) * down))
     return found
 
 
 def _search(score, starts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """All planes tried (k, 2), the first start first, and their scores (k, s); the two best starts are refined."""
+    """All planes tried (k, 3), the first start first, and their scores (k, s); the two best starts are refined."""
     planes, scores = [], []
 
-    def tried(gradient: np.ndarray) -> float:
-        found = score(gradient)
+    def tried(normal: np.ndarray) -> float:
+        found = score(normal)
         if found is None:
             return -np.inf
-        planes.append(gradient)
+        planes.append(normal)
         scores.append(found)
         return float(found[0])
 
-    values = [tried(g) for g in starts]
+    values = [tried(n) for n in starts]
     first = starts[int(np.argmax(values))]
-    apart = [v if _between(first, g) > 15 else -np.inf for g, v in zip(starts, values, strict=True)]
+    apart = [v if _between(first, n) > 15 else -np.inf for n, v in zip(starts, values, strict=True)]
     for start in (int(np.argmax(values)), int(np.argmax(apart))):
-        gradient, best = starts[start], values[start]
+        normal, best = starts[start], values[start]
         for step in (7.0, 3.5, 1.8, 0.9):
-            around = [_tilted(gradient, step, i * np.pi / 3 + step) for i in range(6)]
-            around = [(tried(g), g) for g in around if np.linalg.norm(g) < np.tan(np.radians(STEEPEST))]
-            if around:
-                value, near = max(around, key=lambda pair: pair[0])
-                if value > best:
-                    gradient, best = near, value
+            around = [_tilted(normal, step, i * np.pi / 3 + step) for i in range(6)]
+            value, near = max(((tried(n), n) for n in around), key=lambda pair: pair[0])
+            if value > best:
+                normal, best = near, value
     return np.array(planes), np.array(scores)
 
 
-def _tilted(gradient: np.ndarray, degrees: float, towards: float) -> np.ndarray:
-    """The gradient of the plane tilted further by some degrees, in a direction (radians) of its own."""
-    right, down = plane_axes(gradient)
-    away = np.append(gradient, 1.0) / np.sqrt(1 + gradient @ gradient)
-    away = away + np.tan(np.radians(degrees)) * (np.cos(towards) * right + np.sin(towards) * down)
-    return away[:2] / max(away[2], 1e-3)
+def _tilted(normal: np.ndarray, degrees: float, towards: float) -> np.ndarray:
+    """A unit normal tilted by some degrees in a direction (radians)."""
+    right, down = plane_axes(normal)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return c * normal + s * (np.cos(towards) * right + np.sin(towards) * down)
 
 
 def _between(first: np.ndarray, second: np.ndarray) -> float:
-    """Degrees between the planes of two gradients."""
-    cosine = (1 + first @ second) / np.sqrt((1 + first @ first) * (1 + second @ second))
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def _normal(gradient: np.ndarray) -> np.ndarray:
-    return -np.append(gradient, 1.0) / np.sqrt(1 + gradient @ gradient)
+    """Degrees between two unit vectors."""
+    return float(np.degrees(np.arccos(np.clip(first @ second, -1, 1))))
 
 
 def _principal_point(shape: tuple[int, int]) -> tuple[float, float]:

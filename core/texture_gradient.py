@@ -3,9 +3,9 @@
 Claim: of all planes, the surface's is the one under which the spectra of all windows, brought to the plane's scale and
 foreshortening, agree best. A window around the image point x sees the texture through the linear map A(x) from the
 plane to the image, so its power at the image frequency f is P_x(f) = P(A(x)^T f) |det A(x)|, P being the texture's.
-For a plane with the inverse depth 1 + g.x the score is
+For a plane with the normal n the score is
 
-    -log of the variance of log P_x(f) - log |det A_g(x)| that no common function of A_g(x)^T f explains.
+    -log of the variance of log P_x(f) - log |det A_n(x)| that no common function of A_n(x)^T f explains.
 
 The texture has to be homogeneous; it need not be isotropic. Scores with a part of the region left out (jackknife) tell
 how much one part decides.
@@ -27,7 +27,7 @@ LOWEST, HIGHEST = 2.5 / WINDOW, 0.3  # cycles per px
 OFFSETS = 4  # places of these frequencies, so that no plane is favoured because they fall on the bins' centres
 BIN = 0.35  # octaves
 BLOCKS = 9  # parts of the region, left out one at a time
-NEAREST_HORIZON = 0.04  # least inverse depth of a window, relative to that on the axis
+NEAREST_HORIZON = 0.04  # least inverse depth of a window, relative to the mean
 
 
 @dataclass
@@ -109,32 +109,34 @@ def _blocks(at: np.ndarray) -> np.ndarray:
     return block
 
 
-def plane_axes(gradient: np.ndarray) -> np.ndarray:
-    """(2, 3) unit vectors in the plane with inverse depth 1 + g.x, right and down, camera coordinates.
+def plane_axes(normal: np.ndarray) -> np.ndarray:
+    """(2, 3) unit vectors in a plane, right and down, camera coordinates (x right, y down, z forward).
 
-    The least rotation that turns the plane towards the camera brings them onto the image's axes.
+    normal (3,): unit, away from the camera. The least rotation that takes the optical axis to it brings the image's
+    axes to them.
     """
-    a, b, c = np.array([gradient[0], gradient[1], 1.0]) / np.sqrt(1 + gradient @ gradient)
+    a, b, c = normal
     return np.array([[1 - a * a / (1 + c), -a * b / (1 + c), -a], [-a * b / (1 + c), 1 - b * b / (1 + c), -b]])
 
 
-def local_maps(gradient: np.ndarray, at: np.ndarray) -> np.ndarray:
+def local_maps(normal: np.ndarray, at: np.ndarray) -> np.ndarray:
     """(n, 2, 2) derivatives of the image point by the plane's coordinates, one row per axis of `plane_axes`.
 
-    In units of the focal length over the depth on the axis: unity for a plane seen from the front.
+    In units of the focal length over the plane's distance: unity for a plane seen from the front.
     """
-    axes = plane_axes(gradient)
-    return (axes[:, :2] - at[:, None, :] * axes[:, 2:]) * (1 + at @ gradient)[:, None, None]
+    axes = plane_axes(normal)
+    return (axes[:, :2] - at[:, None, :] * axes[:, 2:]) * (at @ normal[:2] + normal[2])[:, None, None]
 
 
-def gradient_scores(spectra: Spectra, gradient: np.ndarray) -> np.ndarray | None:
-    """(1 + BLOCKS,) the score of a plane, then with each block left out; None where it passes behind the camera.
+def gradient_scores(spectra: Spectra, normal: np.ndarray) -> np.ndarray | None:
+    """(1 + BLOCKS,) the score of a plane, then with each block left out; None where its horizon crosses the region.
 
-    gradient (2,): tangent of the slant times the direction in which the plane comes nearer.
+    normal (3,): unit, away from the camera, camera coordinates.
     """
-    if (1 + spectra.at @ gradient).min() < NEAREST_HORIZON:
+    inverse_depth = spectra.at @ normal[:2] + normal[2]
+    if inverse_depth.min() <= NEAREST_HORIZON * abs(inverse_depth.mean()):
         return None
-    a = local_maps(gradient, spectra.at)
+    a = local_maps(normal, spectra.at)
     density = np.log(np.abs(np.linalg.det(a)))
     k = np.einsum("nmi,nai->nma", spectra.frequency, a) * np.exp(-density.mean() / 2)
     power = spectra.power - (density - density.mean())[:, None]

@@ -191,17 +191,17 @@ def find_focal(segments: Segments, shape: tuple[int, int], seed: int = 0) -> flo
     return float(max(h, w) * FOCALS[0] * (FOCALS[1] / FOCALS[0]) ** (best + np.clip(shift, -1, 1)))
 
 
-def line_score(segments: Segments, gradient: np.ndarray, focal: float, centre: tuple[float, float]) -> float:
+def line_score(segments: Segments, normal: np.ndarray, focal: float, centre: tuple[float, float]) -> float:
     """How much better than at random the segments' directions are told by few directions in a plane, nats per line.
 
-    The mean log density of the directions in the image, when those in the plane with inverse depth 1 + g.x follow their
-    own histogram, over 180 degrees, or over 90 where lines cross at right angles.
+    The mean log density of the directions in the image, when those in the plane of a normal (3,) follow their own
+    histogram, over 180 degrees, or over 90 where lines cross at right angles.
     """
     if len(segments.ends) < 8:
         return 0.0
     middle, unit, _, _, length = _rays(segments.ends, focal, centre)
     weight = length / length.sum()
-    a = local_maps(gradient, middle)
+    a = local_maps(normal, middle)
     det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
     right = (unit[:, 0] * a[:, 1, 1] - unit[:, 1] * a[:, 1, 0]) / det
     down = (unit[:, 1] * a[:, 0, 0] - unit[:, 0] * a[:, 0, 1]) / det

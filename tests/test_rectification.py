@@ -13,10 +13,10 @@ from textures import pebbles, quiet
 FOCAL = 1.1  # in sides of the photo
 
 
-def slanted(texture, gradient, side=384, density=1.0):
-    """A square photo of the plane with inverse depth 1 + g.x, and what of it is surface."""
+def slanted(texture, normal, side=384, density=1.0):
+    """A square photo of a plane, normal (3,) away from the camera."""
     centre = ((side - 1) / 2,) * 2
-    to_photo = rectification.plane_to_photo(np.asarray(gradient, float), FOCAL * side, centre, centre)
+    to_photo = rectification.plane_to_photo(normal, FOCAL * side, centre, centre)
     size = len(texture)
     # the plane's origin lies in the middle of the texture; 4 x 4 samples a px
     fine = 4
@@ -30,7 +30,8 @@ def slanted(texture, gradient, side=384, density=1.0):
 
 
 def tilted(slant, towards):
-    return np.tan(np.radians(slant)) * np.array([np.cos(towards), np.sin(towards)])
+    slant = np.radians(slant)
+    return np.array([np.sin(slant) * np.cos(towards), np.sin(slant) * np.sin(towards), np.cos(slant)])
 
 
 def bricks(side=512):
@@ -48,12 +49,11 @@ def view_of(pixels):
 
 @pytest.mark.parametrize("texture", [pebbles(512, 512), bricks()], ids=["pebbles", "bricks"])
 def test_the_plane_of_a_texture_is_found(texture):
-    gradient = tilted(50, 1.2)
-    pixels = slanted(texture, gradient)
+    normal = tilted(50, 1.2)
+    pixels = slanted(texture, normal)
     found = rectification.rectify(pixels, np.ones(pixels.shape[:2], bool), view_of(pixels))
-    truth = -np.append(gradient, 1) / np.sqrt(1 + gradient @ gradient)
     assert found.method == "auto"
-    assert np.degrees(np.arccos(found.normal @ truth)) < 8
+    assert np.degrees(np.arccos(found.normal @ -normal)) < 8
 
 
 def test_a_region_seen_from_the_front_stays_bit_for_bit():
@@ -68,36 +68,35 @@ def test_noise_on_a_plain_wall_is_no_plane():
     assert found.method == "off"
 
 
-def corners_in_photo(gradient, rectangle, side=384):
+def corners_in_photo(normal, rectangle, side=384):
     centre = ((side - 1) / 2,) * 2
-    to_photo = rectification.plane_to_photo(np.asarray(gradient, float), FOCAL * side, centre, centre)
+    to_photo = rectification.plane_to_photo(normal, FOCAL * side, centre, centre)
     points = np.append(np.array(rectangle, float), np.ones((4, 1)), 1) @ to_photo.T
     return points[:, :2] / points[:, 2:]
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_four_corners_give_normal_and_proportions(known):
-    gradient = tilted(45, 0.7)
+    truth = tilted(45, 0.7)
     rectangle = [(-0.3, -0.1), (0.3, -0.1), (0.3, 0.1), (-0.3, 0.1)]  # 3 : 1
-    corners = corners_in_photo(gradient, rectangle)
+    corners = corners_in_photo(truth, rectangle)
     to_photo, normal = rectification.plane_of_corners(corners, (384, 384), FOCAL * 384 if known else None)
-    truth = -np.append(gradient, 1) / np.sqrt(1 + gradient @ gradient)
-    assert np.degrees(np.arccos(np.clip(normal @ truth, -1, 1))) < 0.1
+    assert np.degrees(np.arccos(np.clip(normal @ -truth, -1, 1))) < 0.1
     back = np.linalg.inv(to_photo) @ np.append(corners, np.ones((4, 1)), 1).T
     back = (back[:2] / back[2]).T
     assert back == pytest.approx(np.array([[0, 0], [1, 0], [1, 1 / 3], [0, 1 / 3]]), abs=1e-3)
 
 
 def test_rectified_by_corners_the_texture_is_the_flat_one():
-    texture, gradient = cv2.GaussianBlur(pebbles(512, 512), (0, 0), 2), tilted(40, 0)
-    pixels = slanted(texture, gradient)
-    corners = corners_in_photo(gradient, [(-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)])
+    texture, normal = cv2.GaussianBlur(pebbles(512, 512), (0, 0), 2), tilted(40, 0)
+    pixels = slanted(texture, normal)
+    corners = corners_in_photo(normal, [(-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)])
     mask = np.zeros((384, 384), np.uint8)
     cv2.fillConvexPoly(mask, np.rint(corners).astype(np.int32), 1)
     found = rectification.rectify_corners(pixels, mask > 0, corners, FOCAL * 384)
     centre = ((384 - 1) / 2,) * 2
     to_texture = np.array([[FOCAL * 384, 0, 256], [0, FOCAL * 384, 256], [0, 0, 1]])
-    to_texture = to_texture @ np.linalg.inv(rectification.plane_to_photo(gradient, FOCAL * 384, centre, centre))
+    to_texture = to_texture @ np.linalg.inv(rectification.plane_to_photo(normal, FOCAL * 384, centre, centre))
     to_texture = to_texture @ found.homography
     to_texture /= to_texture[2, 2]
     similarity = to_texture[:2, :2]

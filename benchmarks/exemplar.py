@@ -1,0 +1,383 @@
+#!/usr/bin/env python3
+"""From a region in the wild to a flat, evenly lit exemplar: error against the severity of each disturbance.
+
+    python benchmarks/exemplar.py --data DATA -o benchmarks/results/exemplar/             about an hour on two cores
+    python benchmarks/exemplar.py --data DATA --quick -o dist/benchmarks/                 5 minutes
+
+DATA holds INDEX.csv and pbr/<set>/<material>/basecolor.jpg. Of its materials only the test split takes part: all of
+polyhaven and every fourth of the other sets. A family of disturbances makes photos of a known texture at growing
+severity and judges what the product makes of them; see FAMILIES. Writes exemplar.csv (a row per case; a run that was
+stopped goes on from it), exemplar.json (machine, command, summary), exemplar.svg and .png (the chart). Needs
+requirements-benchmarks.txt besides requirements.txt.
+"""
+
+import argparse
+import csv
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import dev  # noqa: E402
+
+dev.load_package()
+from material_palette.benchmarks import measures  # noqa: E402
+from material_palette.benchmarks.texture import commit, machine  # noqa: E402
+from material_palette.core import rectification  # noqa: E402
+from material_palette.core.engines import patch  # noqa: E402
+from material_palette.core.exemplar import cut_exemplar  # noqa: E402
+from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
+from material_palette.core.texture_gradient import plane_axes  # noqa: E402
+
+SAMPLES = 2  # of the rendered photos, per px and axis
+FALSE = 20.0  # degrees of error, from which on a claimed plane is a false one
+LINED = {"brick", "tiles", "paving", "roof", "facade", "solar"}
+LINED_NAMES = (
+    "WoodSiding",
+    "WoodFloor",
+    "wood_fence",
+    "wood_road",
+    "garage_door",
+    "block_wall",
+    "tile_",
+    "Check",
+    "Pannel",
+)
+UNIFORM = ("Engraved_Metal", "Metal049A", "Plastic007", "Paper001", "Lead", "tile_default_metal")
+
+
+@dataclass
+class Texture:
+    """pixels (h, w, 3) float32 linear, tileable; kind "lines" or "stochastic"."""
+
+    name: str
+    kind: str
+    pixels: np.ndarray
+
+
+@dataclass
+class Family:
+    """One disturbance. make(texture, severity, random, side) -> a photo; judge(photo, texture, full) -> measures.
+
+    full: also the slow measures. A measure is a number; it is charted against the severity, "before" and "after" as two
+    curves of one panel when the names end so.
+    """
+
+    axis: str
+    severities: tuple[float, ...]
+    make: Callable
+    judge: Callable
+    charted: tuple[tuple[str, str], ...]  # measure, label
+
+
+@dataclass
+class Slanted:
+    """A photo of a plane: pixels (side, side, 3) float32 linear, mask; the truth."""
+
+    pixels: np.ndarray
+    mask: np.ndarray
+    normal: np.ndarray  # (3,), away from the camera
+    focal: float
+    density: float  # texture px per photo px on the axis
+    known: bool
+
+
+# ---------------------------------------------------------------- slant
+
+
+def slanted(texture: Texture, slant: float, random: np.random.Generator, side: int, known: bool = True) -> Slanted:
+    """A perspective photo at a random tilt, turn, focal length and scale, of a whole frame or of a part of it."""
+    tilt, turn = random.uniform(0, 2 * np.pi, 2)
+    focal = side * random.uniform(0.7, 1.5)
+    density = random.uniform(0.7, 1.3) * min(texture.pixels.shape[:2]) / 640
+    c, s = np.cos(np.radians(slant)), np.sin(np.radians(slant))
+    normal = np.array([s * np.cos(tilt), s * np.sin(tilt), c])
+    pixels, mask = photograph(texture.pixels, normal, focal, (side, side), density, turn, random)
+    mask &= shape_of_region(side, random)
+    return Slanted(pixels, mask, normal, focal, density, known)
+
+
+def shape_of_region(side: int, random: np.random.Generator) -> np.ndarray:
+    """Half of the regions are the whole frame, the others an ellipse in it."""
+    whole = random.random() < 0.5
+    centre, axes = random.uniform(0.4, 0.6, 2) * side, random.uniform(0.3, 0.5, 2) * side
+    turn = random.uniform(0, 180)
+    if whole:
+        return np.ones((side, side), bool)
+    mask = np.zeros((side, side), np.uint8)
+    cv2.ellipse(mask, (tuple(centre), tuple(2 * axes), turn), 1, -1)
+    return mask > 0
+
+
+def photograph(
+    texture: np.ndarray, normal: np.ndarray, focal: float, size: tuple[int, int], density: float, turn: float, random
+):
+    """Photo (h, w, 3) linear of a plane at the distance 1 along the axis, and the mask of what is no farther than 16.
+
+    normal (3,): away from the camera; density: texture px per photo px where seen from the front. SAMPLES x SAMPLES
+    point samples a px from a mip map; noise of 1 / 255 and 8 bits.
+    """
+    h, w = size
+    c, s = np.cos(turn), np.sin(turn)
+    axes = np.array([[c, s], [-s, c]]) @ plane_axes(normal)
+    levels = [np.ascontiguousarray(texture, np.float32)]
+    while min(levels[-1].shape[:2]) > 4:
+        levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    levels = [np.pad(level, ((1, 2), (1, 2), (0, 0)), mode="wrap") for level in levels]
+    start = random.uniform(0, 1000, 2)
+    photo, mask = np.zeros((h, w, 3), np.float32), np.ones((h, w), bool)
+    for i in range(SAMPLES**2):
+        x = (np.arange(w) + (i % SAMPLES + 0.5) / SAMPLES - 0.5 - (w - 1) / 2) / focal
+        y = (np.arange(h) + (i // SAMPLES + 0.5) / SAMPLES - 0.5 - (h - 1) / 2) / focal
+        ray = np.stack(np.meshgrid(x, y) + [np.ones((h, w))], -1)
+        inverse = ray @ normal / normal[2]
+        mask &= inverse > 0.06
+        point = ray / np.maximum(inverse, 0.06)[..., None] - [0, 0, 1]
+        at = point @ axes.T * focal * density
+        change = (
+            max(np.hypot(*np.moveaxis(np.gradient(at, axis=a), -1, 0)) for a in (0, 1))
+            if False
+            else np.maximum(
+                np.linalg.norm(np.gradient(at, axis=0), axis=-1), np.linalg.norm(np.gradient(at, axis=1), axis=-1)
+            )
+        )
+        depth = np.clip(np.log2(np.maximum(change / SAMPLES, 1e-3)), 0, len(levels) - 1.001)
+        for k in range(int(depth.min()), int(depth.max()) + 2):
+            weight = np.maximum(0, 1 - np.abs(depth - k)).astype(np.float32)[..., None]
+            rows, columns = (n - 3 for n in levels[k].shape[:2])
+            u, v = ((at[..., a] + start[a] + 0.5) / 2**k - 0.5 for a in (0, 1))
+            place = (u % columns + 1).astype(np.float32), (v % rows + 1).astype(np.float32)
+            photo += weight * cv2.remap(levels[k], *place, cv2.INTER_LINEAR)
+    encoded = srgb_from_linear(np.clip(photo / SAMPLES**2, 0, 1))
+    encoded += (random.standard_normal(encoded.shape) / 255).astype(np.float32)
+    return linear_from_srgb(np.rint(encoded.clip(0, 1) * 255) / np.float32(255)), mask
+
+
+def judge_slanted(photo: Slanted, texture: Texture, full: bool) -> dict:
+    start = time.process_time()
+    view = rectification.look(photo.pixels, photo.focal if photo.known else None)
+    found = rectification.rectify(photo.pixels, photo.mask, view)
+    seconds = time.process_time() - start
+    error = ""
+    if found.normal is not None:
+        error = float(np.degrees(np.arccos(np.clip(-found.normal @ photo.normal, -1, 1))))
+    claimed = found.homography is not None
+    result = {
+        "cpu_seconds": seconds,
+        "megapixels": photo.mask.sum() / 1e6,
+        "claimed": float(claimed),
+        "normal_error": error if claimed else "",
+        "untouched_error": float(np.degrees(np.arccos(photo.normal[2]))) if not claimed else "",
+        "false": float(claimed and error > FALSE),
+        "confidence": found.confidence,
+    }
+    if full:
+        plain = rectification.Rectification(photo.pixels, photo.mask)
+        result |= {"swd_before": swd_to_flat(plain, photo, texture), "swd_after": swd_to_flat(found, photo, texture)}
+    return result
+
+
+def swd_to_flat(found: rectification.Rectification, photo: Slanted, texture: Texture, size: int = 256) -> float:
+    """Patch SWD of the texture synthesised from an exemplar to the true flat one, at the exemplar's own scale.
+
+    The scale is that of the true plane in the middle of the exemplar, the geometric mean of both directions.
+    """
+    exemplar = cut_exemplar(found.pixels, found.mask)
+    encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
+    concept = patch.learn(encoded, exemplar.mask, _quiet)
+    made = patch.sample(concept, (size, size), 0, _quiet, "draft").pixels
+    h = found.homography if found.homography is not None else np.eye(3)
+    side = photo.mask.shape[0]
+    centre = ((side - 1) / 2,) * 2
+    to_plane = np.linalg.inv(rectification.plane_to_photo(photo.normal, photo.focal, centre, centre)) @ h
+    y, x = (np.median(v) for v in np.nonzero(found.mask))
+    bottom = to_plane[2] @ [x, y, 1]
+    scale = np.sqrt(abs(np.linalg.det(to_plane)) / abs(bottom) ** 3) * photo.focal * photo.density  # texture px a texel
+    tiled = np.tile(texture.pixels, (2, 2, 1))
+    w, h = (max(64, round(n / scale)) for n in tiled.shape[1::-1])
+    shrink = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
+    flat = srgb_from_linear(np.clip(cv2.resize(tiled, (w, h), interpolation=shrink), 0, 1))
+    # the colour is not at stake
+    flat = flat + (made.mean((0, 1)) - flat.mean((0, 1)))
+    whole = np.ones(flat.shape[:2], bool)
+    return measures.sliced_wasserstein(measures.patch_quantiles(made), measures.patch_quantiles(flat, whole))
+
+
+def _quiet(fraction: float, message: str) -> None:
+    pass
+
+
+SLANTS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 75.0)
+SLANT_CURVES = (
+    ("normal_error", "error of the normal where rectified, degrees"),
+    ("claimed", "share rectified"),
+    ("swd", "patch SWD to the flat texture"),
+)
+FAMILIES = {
+    "slant": Family("slant, degrees; focal length known", SLANTS, slanted, judge_slanted, SLANT_CURVES),
+    "slant-focal": Family(
+        "slant, degrees; focal length not known",
+        SLANTS,
+        lambda texture, severity, random, side: slanted(texture, severity, random, side, known=False),
+        judge_slanted,
+        SLANT_CURVES[:2],
+    ),
+}
+
+
+# ---------------------------------------------------------------- running
+
+
+def read_textures(data: Path) -> list[Texture]:
+    """The test split's base colours that have a texture at all, sorted by path."""
+    with open(data / "INDEX.csv", encoding="utf-8") as file:
+        rows = sorted((row for row in csv.DictReader(file) if row["kind"] == "pbr"), key=lambda row: row["path"])
+    sets = {}
+    for row in rows:
+        sets.setdefault(row["path"].split("/")[1], []).append(row)
+    found = []
+    for name, members in sets.items():
+        for row in members if name == "polyhaven" else members[3::4]:
+            if any(part in row["path"] for part in UNIFORM):
+                continue
+            lined = row["class"] in LINED or any(part in row["path"] for part in LINED_NAMES)
+            pixels = read_photo(data / row["path"] / "basecolor.jpg").pixels
+            found.append(Texture(row["path"][4:], "lines" if lined else "stochastic", pixels))
+    return found
+
+
+def run(textures: list[Texture], families: list[str], side: int, slow: int, path: Path, limit: float) -> list[dict]:
+    """Rows of the CSV at `path`, which is added to: a case that stands there is not run again.
+
+    slow: of so many textures the slow measures are taken too; limit: seconds after which no case is begun.
+    """
+    rows = []
+    if path.exists():
+        with open(path, encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    done = {(row["family"], float(row["severity"]), row["texture"]) for row in rows}
+    start = time.monotonic()
+    cases = [
+        (name, severity, i) for i in range(len(textures)) for name in families for severity in FAMILIES[name].severities
+    ]
+    # in an order that gives all severities and all textures a share of a run that is stopped
+    order = np.random.default_rng(0).permutation(len(cases))
+    for name, severity, i in (cases[k] for k in order):
+        texture = textures[i]
+        if (name, severity, texture.name) in done or time.monotonic() - start > limit:
+            continue
+        family = FAMILIES[name]
+        photo = family.make(texture, severity, np.random.default_rng([i, int(severity)]), side)
+        judged = family.judge(photo, texture, i % max(1, len(textures) // max(slow, 1)) == 0 and slow > 0)
+        judged = {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in judged.items()}
+        rows.append({"family": name, "severity": severity, "texture": texture.name, "kind": texture.kind} | judged)
+        columns = list(dict.fromkeys(key for row in rows for key in row))
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n", restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+        print(name, severity, texture.name, judged, flush=True)
+    return rows
+
+
+def summarise(rows: list[dict]) -> dict:
+    """Per family, kind and severity the number of cases, and of every measure the median, or the mean of a share."""
+    summary = {}
+    keys = sorted({(row["family"], row["kind"], float(row["severity"])) for row in rows})
+    for family, kind, severity in keys:
+        own = [row for row in rows if (row["family"], row["kind"], float(row["severity"])) == (family, kind, severity)]
+        entry = {"cases": len(own)}
+        for measure in own[0].keys() - {"family", "severity", "texture", "kind"}:
+            values = [float(row[measure]) for row in own if row.get(measure) not in ("", None)]
+            if values:
+                share = measure in ("claimed", "false")
+                entry[measure] = float(f"{(np.mean if share else np.median)(values):.4g}")
+        summary.setdefault(family, {}).setdefault(kind, {})[f"{severity:g}"] = dict(sorted(entry.items()))
+    return summary
+
+
+def write_chart(summary: dict, folder: Path) -> None:
+    """A row of panels per family: each measure's median against the severity, per kind of texture, before and after."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    matplotlib.rcParams.update({"svg.hashsalt": "exemplar", "svg.fonttype": "none", "font.size": 8})
+    import matplotlib.pyplot as plt
+
+    names = [name for name in FAMILIES if name in summary]
+    across = max(len(FAMILIES[name].charted) for name in names)
+    figure, axes = plt.subplots(len(names), across, figsize=(3.4 * across, 2.7 * len(names)), squeeze=False)
+    for row, name in zip(axes, names, strict=True):
+        for place in row[len(FAMILIES[name].charted) :]:
+            place.set_visible(False)
+        for place, (measure, label) in zip(row, FAMILIES[name].charted, strict=False):
+            for kind, colour in (("lines", "tab:red"), ("stochastic", "tab:blue")):
+                for suffix, style, said in (("_before", ":", ", as seen"), ("_after", "-", ""), ("", "-", "")):
+                    curve = [
+                        (float(severity), entry[measure + suffix])
+                        for severity, entry in summary[name].get(kind, {}).items()
+                        if measure + suffix in entry
+                    ]
+                    if curve:
+                        place.plot(
+                            *zip(*sorted(curve), strict=True), style, color=colour, marker=".", label=kind + said
+                        )
+            place.set_xlabel(FAMILIES[name].axis)
+            place.set_ylabel(label)
+            place.set_ylim(bottom=0)
+            place.grid(lw=0.3, alpha=0.5)
+            place.legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(folder / "exemplar.svg", metadata={"Date": None})
+    figure.savefig(folder / "exemplar.png", dpi=110, metadata={"Software": None})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, metavar="DATA", help="folder with INDEX.csv and pbr/")
+    parser.add_argument("--quick", action="store_true", help="every third texture, small photos, no synthesis")
+    parser.add_argument("--families", nargs="+", choices=list(FAMILIES), default=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--side", type=int, default=0, help="px of the photos (1000; quick 448)")
+    parser.add_argument("--slow", type=int, default=8, help="textures that are synthesised too (8; quick 0)")
+    parser.add_argument("--minutes", type=float, default=1e6, help="stop after; the next call goes on")
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    textures = read_textures(options.data)[:: 3 if options.quick else 1]
+    side, slow = options.side or (448 if options.quick else 1000), 0 if options.quick else options.slow
+    options.output.mkdir(parents=True, exist_ok=True)
+    start = time.time()
+    path = options.output / "exemplar.csv"
+    rows = run(textures, options.families, side, slow, path, 60 * options.minutes)
+    summary = summarise(rows)
+    command = ["DATA" if a == str(options.data) else a for a in arguments or sys.argv[1:]]
+    facts = {
+        "command": " ".join(["benchmarks/exemplar.py", *command]),
+        "commit": commit(),
+        "machine": machine(),
+        "minutes": round((time.time() - start) / 60, 1),
+        "side": side,
+        "false_share": {
+            name: float(f"{np.mean(shares):.4g}")
+            for name in options.families
+            if (shares := [float(r["false"]) for r in rows if r["family"] == name and r.get("false") not in (None, "")])
+        },
+        "summary": summary,
+    }
+    (options.output / "exemplar.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    write_chart(summary, options.output)
+    print(json.dumps(facts["false_share"]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
