@@ -230,7 +230,9 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     scale = min(1.0, LOOKED_AT / float(mask.sum()) ** 0.5)
     size = max(1, round((box[1].stop - box[1].start) * scale)), max(1, round((box[0].stop - box[0].start) * scale))
     grey = cv2.resize(np.ascontiguousarray(pixels[box] @ LUMINANCE), size, interpolation=cv2.INTER_AREA)
-    seen = mask[box] & (pixels[box] < CLIPPED).any(-1)
+    # pictures of more than white are not clipped
+    white = CLIPPED if pixels[mask].max() <= 1.001 else np.inf
+    seen = mask[box] & (pixels[box] < white).any(-1)
     small = cv2.resize(seen.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     centre = np.array(_principal_point(mask.shape))
     own = ((centre - (box[1].start, box[0].start)) + 0.5) * scale - 0.5
