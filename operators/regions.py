@@ -146,20 +146,12 @@ def painted_region(settings, space):
     return next((region for region in settings.regions if image is not None and region.mask == image), None)
 
 
-def _soft_brush(context):
-    """Take a soft round brush; return whether there is a brush."""
+def _has_brush(context):
+    """Whether there is a brush to paint with. From 4.3 on brushes are assets, which Blender takes by itself where it has
+    them; some distributions leave them out, and asking for one by its operator here ends 5.2 with a crash."""
     paint = context.scene.tool_settings.image_paint
-    if bpy.app.version < (4, 3, 0):
-        if paint.brush is None:
-            paint.brush = bpy.data.brushes.get("TexDraw") or bpy.data.brushes.new("TexDraw", mode="TEXTURE_PAINT")
-        return True
-    try:  # from 4.3 on brushes are assets; some distributions leave them out
-        bpy.ops.brush.asset_activate(
-            asset_library_type="ESSENTIALS",
-            relative_asset_identifier="brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Soft",
-        )
-    except RuntimeError:
-        pass
+    if bpy.app.version < (4, 3, 0) and paint.brush is None:
+        paint.brush = bpy.data.brushes.get("TexDraw") or bpy.data.brushes.new("TexDraw", mode="TEXTURE_PAINT")
     return paint.brush is not None
 
 
@@ -270,9 +262,8 @@ class MATERIAL_PALETTE_OT_paint_region(NeedsPhoto, Operator):
         space = area.spaces.active
         space.image = region.mask
         space.mode = "PAINT"
-        with context.temp_override(area=area, region=next(r for r in area.regions if r.type == "WINDOW")):
-            if not _soft_brush(context):
-                self.report({"WARNING"}, "This Blender has no brush to paint with: choose one, or draw with the lasso")
+        if not _has_brush(context):
+            self.report({"WARNING"}, "There is no brush to paint with: choose one, or draw with the lasso")
         _paint_colours(context, self.erase)
         region.automatic = False
         area.tag_redraw()

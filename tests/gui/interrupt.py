@@ -35,7 +35,7 @@ def begin():
         bpy.ops.material_palette.import_masks(directory=os.environ["PALETTE_MASKS"])
         settings = bpy.context.scene.material_palette
         settings.quality, settings.resolution = "draft", 64
-        for region in list(settings.regions)[1:]:
+        for region in list(settings.regions)[:-1]:  # the wall; the pavement is of one colour and made at once
             region.enabled = False
         bpy.ops.ed.undo_push(message="Set up")
         bpy.data.objects["Cube"].location.x = 1.0
