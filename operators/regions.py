@@ -147,8 +147,11 @@ def painted_region(settings, space):
 
 
 def _has_brush(context):
-    """Whether there is a brush to paint with. From 4.3 on brushes are assets, which Blender takes by itself where it has
-    them; some distributions leave them out, and asking for one by its operator here ends 5.2 with a crash."""
+    """Whether there is a brush to paint with.
+
+    From 4.3 on brushes are assets, which Blender takes by itself where it has them; some distributions leave them out.
+    Asking for one by its operator at this point ends Blender 5.2 with a crash.
+    """
     paint = context.scene.tool_settings.image_paint
     if bpy.app.version < (4, 3, 0) and paint.brush is None:
         paint.brush = bpy.data.brushes.get("TexDraw") or bpy.data.brushes.new("TexDraw", mode="TEXTURE_PAINT")
