@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
-from material_palette.benchmarks import measures  # noqa: E402
+from material_palette.benchmarks import lighting, measures  # noqa: E402
 from material_palette.benchmarks.texture import commit, machine  # noqa: E402
 from material_palette.core import rectification  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
@@ -61,6 +61,7 @@ class Texture:
     name: str
     kind: str
     pixels: np.ndarray
+    folder: Path | None = None  # of its maps
 
 
 @dataclass
@@ -231,6 +232,11 @@ FAMILIES = {
         SLANT_CURVES[:2],
     ),
 }
+for _name, (_axis, _severities) in lighting.FAMILIES.items():
+    _curves = (("foreign", "share of foreign pixels"),) if _name == "foreign" else tuple(lighting.CURVES.items())
+    if _name == "two tones":
+        _curves = (("changed", "share changed noticeably"),)
+    FAMILIES[_name] = Family(_axis, _severities, lighting.make(_name), lighting.judge, _curves)
 
 
 # ---------------------------------------------------------------- running
@@ -250,7 +256,7 @@ def read_textures(data: Path) -> list[Texture]:
                 continue
             lined = row["class"] in LINED or any(part in row["path"] for part in LINED_NAMES)
             pixels = read_photo(data / row["path"] / "basecolor.jpg").pixels
-            found.append(Texture(row["path"][4:], "lines" if lined else "stochastic", pixels))
+            found.append(Texture(row["path"][4:], "lines" if lined else "stochastic", pixels, data / row["path"]))
     return found
 
 
@@ -298,7 +304,7 @@ def summarise(rows: list[dict]) -> dict:
         for measure in own[0].keys() - {"family", "severity", "texture", "kind"}:
             values = [float(row[measure]) for row in own if row.get(measure) not in ("", None)]
             if values:
-                share = measure in ("claimed", "false")
+                share = measure in ("claimed", "false", "shadow", "changed")
                 entry[measure] = float(f"{(np.mean if share else np.median)(values):.4g}")
         summary.setdefault(family, {}).setdefault(kind, {})[f"{severity:g}"] = dict(sorted(entry.items()))
     return summary

@@ -4,13 +4,18 @@ A `Case` is what a photo shows of a known surface. Sun and sky differ in colour,
 camera rounds to 8 bits and adds noise, as photos do.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from material_palette.core.image import linear_from_srgb, srgb_from_linear
+
+from ..core.delighting import masked_blur
+from ..core.exemplar import LUMINANCE, cut_exemplar
+from ..core.image import linear_from_srgb, srgb_from_linear
+from . import measures
 
 SIDE = 512  # px of a case
 SUN = np.array([1.08, 1.0, 0.86], np.float32)
@@ -40,19 +45,6 @@ class Case:
     mask: np.ndarray
     light: np.ndarray
     foreign: np.ndarray
-
-
-def materials(data: Path, training: bool = False) -> list[Path]:
-    """Folders of test materials, or of those to tune on: the split of `training/analytic.py`."""
-    found = []
-    for collection in sorted((data / "pbr").iterdir()):
-        if collection.name.endswith("-derived"):
-            continue
-        for i, folder in enumerate(sorted(collection.iterdir())):
-            held_out = collection.name == "polyhaven" or i % 4 == 3
-            if held_out != training and (folder / "basecolor.jpg").exists() and (folder / "normal.jpg").exists():
-                found.append(folder)
-    return found
 
 
 def read_surface(folder: Path) -> Surface:
@@ -164,8 +156,13 @@ FAMILIES: dict[str, tuple[str, tuple[float, ...]]] = {
     "leaf shadow": ("lit to shaded", (2, 3, 5)),
     "clipping": ("share over-exposed", (0, 0.1, 0.2, 0.4)),
     "foreign": ("share of another material", (0, 0.05, 0.1, 0.2, 0.4)),
+    "two tones": ("chequers, bricks, planks, stains, dado, stripes", (0, 1, 2, 3, 4, 5)),
 }
-CLEAN = {"ramp": 1, "vignetting": 1, "clipping": 0, "foreign": 0}  # severity at which nothing is wrong
+CURVES = {
+    "halves": "CIEDE2000, lit to shaded half",
+    "contrast": "contrast of the detail, found / true",
+    "swd": "patch SWD to the truth x 1000",
+}
 
 
 def _noise(random: np.random.Generator, sigma: float) -> np.ndarray:
@@ -221,4 +218,115 @@ def _strip(random: np.random.Generator, mask: np.ndarray, share: float) -> np.nd
     return mask & (x < np.percentile(x[mask], 100 * share))
 
 
-Render = Callable[[Surface, float, int], Case]
+# ---------------------------------------------------------------- judging
+
+NOTICEABLE = 2.0  # CIEDE2000, mean over the pixels of a clean exemplar
+
+
+def colour_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """CIEDE2000 (Sharma et al. 2005) of linear Rec.709 colours (..., 3)."""
+    lab = [
+        cv2.cvtColor(srgb_from_linear(np.clip(x, 0, 1)).reshape(1, -1, 3), cv2.COLOR_RGB2LAB)[0]
+        for x in (first, second)
+    ]
+    (l1, a1, b1), (l2, a2, b2) = (np.moveaxis(x.astype(np.float64), -1, 0) for x in lab)
+    chroma = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2
+    stretch = 1.5 - 0.5 * np.sqrt(chroma**7 / (chroma**7 + 25.0**7))
+    a1, a2 = a1 * stretch, a2 * stretch
+    c1, c2 = np.hypot(a1, b1), np.hypot(a2, b2)
+    h1, h2 = np.degrees(np.arctan2(b1, a1)) % 360, np.degrees(np.arctan2(b2, a2)) % 360
+    turn = np.where(c1 * c2 == 0, 0, (h2 - h1 + 180) % 360 - 180)
+    hue = np.where(c1 * c2 == 0, h1 + h2, (h1 + turn / 2) % 360)
+    light, chroma = (l1 + l2) / 2, (c1 + c2) / 2
+    dl, dc, dh = l2 - l1, c2 - c1, 2 * np.sqrt(c1 * c2) * np.sin(np.radians(turn / 2))
+
+    def cosine(degrees):
+        return np.cos(np.radians(degrees))
+
+    t = 1 - 0.17 * cosine(hue - 30) + 0.24 * cosine(2 * hue) + 0.32 * cosine(3 * hue + 6) - 0.2 * cosine(4 * hue - 63)
+    sl = 1 + 0.015 * (light - 50) ** 2 / np.sqrt(20 + (light - 50) ** 2)
+    sc, sh = 1 + 0.045 * chroma, 1 + 0.015 * chroma * t
+    rotation = (
+        -2 * np.sqrt(chroma**7 / (chroma**7 + 25.0**7)) * np.sin(np.radians(60 * np.exp(-(((hue - 275) / 25) ** 2))))
+    )
+    return np.sqrt((dl / sl) ** 2 + (dc / sc) ** 2 + (dh / sh) ** 2 + rotation * dc / sc * dh / sh)
+
+
+def _judged(case: Case, pixels: np.ndarray, kept: np.ndarray, truth: list) -> dict[str, float]:
+    """How far pixels (H, W, 3) linear are from the truth over what is kept (H, W) bool.
+
+    halves: CIEDE2000 between the mean colour as found on the brighter and on the darker half; contrast: of the detail,
+    found over true; swd: of the patches to those of the whole truth, x 1000, exposures matched. truth: those patches.
+    """
+    own = kept & ~case.foreign
+    gain = np.log(np.maximum(pixels, 1e-4) / np.maximum(case.truth, 1e-4))
+    low, high = np.percentile(case.light[case.mask], (2, 98))
+    bright = case.light > np.sqrt(low * high)
+    halves = np.nan
+    if high > 1.05 * low and min((own & bright).sum(), (own & ~bright).sum()) > 500:
+        first, second = (np.median(gain[own & side], 0) for side in (bright, ~bright))
+        middle = np.log(case.truth[case.mask].mean(0)) - np.mean(first + second) / 2
+        halves = float(colour_difference(np.exp(middle + first)[None], np.exp(middle + second)[None])[0])
+    spread = []
+    for x in (pixels, case.truth):
+        y = np.log(np.maximum(x @ LUMINANCE, 1e-3))
+        spread.append(float((y - masked_blur(y, own, SIDE / 40))[own].std()))
+    exposure = np.exp(-np.median(gain[own]))
+    swd = 1000 * measures.sliced_wasserstein(patches(pixels * exposure, kept), truth)
+    return {"halves": halves, "contrast": spread[0] / spread[1], "swd": swd}
+
+
+def patches(pixels: np.ndarray, mask: np.ndarray) -> list:
+    """`measures.patch_quantiles` of linear pixels at half their size."""
+    size = mask.shape[1] // 2, mask.shape[0] // 2
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    inside = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    return measures.patch_quantiles(srgb_from_linear(np.clip(small, 0, 1)), inside)
+
+
+def judge(case: Case, texture, full: bool) -> dict:
+    """Before: the photo as painted; after: the exemplar."""
+    start = time.process_time()
+    exemplar = cut_exemplar(case.photo, case.mask)
+    seconds = time.process_time() - start
+    rows, columns = np.flatnonzero(case.mask.any(1)), np.flatnonzero(case.mask.any(0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    pixels, kept = case.photo.copy(), np.zeros_like(case.mask)
+    pixels[box], kept[box] = exemplar.pixels, exemplar.mask
+    truth = patches(case.truth, case.mask)
+    row = {f"{name}_before": value for name, value in _judged(case, case.photo, case.mask, truth).items()}
+    row |= {f"{name}_after": value for name, value in _judged(case, pixels, kept, truth).items()}
+    foreign = case.foreign.sum()
+    photo = case.photo * np.exp(np.median(np.log(np.maximum(pixels, 1e-4) / np.maximum(case.photo, 1e-4))[kept]))
+    changed = float(colour_difference(photo[kept], pixels[kept]).mean())
+    lost = float((case.mask & ~case.foreign & ~kept).sum() / (case.mask & ~case.foreign).sum())
+    shadow = any("cast shadow" in warning for warning in exemplar.warnings)
+    row |= {
+        "cpu_seconds": seconds,
+        "megapixels": case.mask.sum() / 1e6,
+        "foreign_before": float(foreign / case.mask.sum()),
+        "foreign_after": float((kept & case.foreign).sum() / kept.sum()),
+        "lost": lost,
+        "shadow": float(shadow),
+        "changed": float(changed > NOTICEABLE or lost > 0.02 or shadow),
+    }
+    return {key: "" if value != value else value for key, value in row.items()}
+
+
+def make(family: str) -> Callable:
+    """What `exemplar.py` calls for a photo of a texture; the photo's side is SIDE."""
+
+    def photographed(texture, severity: float, random: np.random.Generator, side: int) -> Case:
+        seed = int(random.integers(1 << 30))
+        if family == "two tones":
+            return case(two_tone(TWO_TONES[int(severity)], seed), "ramp", 1, seed)
+        stranger = _neighbour(texture.folder) if family == "foreign" and severity else None
+        return case(read_surface(texture.folder), family, severity, seed, stranger and read_surface(stranger))
+
+    return photographed
+
+
+def _neighbour(folder: Path) -> Path:
+    """The next material of the set."""
+    others = [other for other in sorted(folder.parent.iterdir()) if (other / "normal.jpg").exists()]
+    return others[(others.index(folder) + 1) % len(others)]

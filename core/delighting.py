@@ -27,6 +27,7 @@ SMOOTHNESS = 0.3  # sigma of what counts as slow, in sides of the square with th
 LEAST_SIGMA = 12.0  # px
 # of a shadow; read off the training materials, shadows and two-tone surfaces
 LEAST_STEP = 0.2  # of log luminance
+SOFTEST = 0.032  # sides: sigma of a border; softer ones are slow changes
 MOST_STEP = 2.3  # the same; one to ten
 MOST_ADDED, MOST_TAKEN = 0.4, 1.4  # change of log contrast, from lit to shaded
 NOISE = 0.01  # contrast of a cell that sensor and rounding make
@@ -291,7 +292,7 @@ def _border(x: np.ndarray, inside: np.ndarray, lit: np.ndarray) -> _Border | Non
     coloured = green > max(GREENEST, 0.06 / height) or blue < WARMEST
     if coloured or length > LONGEST or (length > LONGEST_PLAIN and blue < BLUISH):
         return None
-    if height > MOST_STEP or not _same_texture(x, inside, distance):
+    if sigma > SOFTEST * side or height > MOST_STEP or not _same_texture(x, inside, distance):
         return None
     score = same - 0.5 * float(np.median(off)) / height - 0.02 * length
     return _Border(distance.astype(np.float32), sigma, step.astype(np.float32), score)
