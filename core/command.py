@@ -59,7 +59,8 @@ def _parser() -> argparse.ArgumentParser:
         help="one mask image per material, named as the material; for several photos DIR/<photo's name>/. "
         "Or one image of colours or indices, or COCO's JSON",
     )
-    where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto")
+    where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto, or sam with --weights")
+    extract.add_argument("--weights", type=Path, metavar="DIR", help="folder of Segment Anything's weights")
     extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
     extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
     extract.add_argument(
@@ -163,7 +164,12 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         else:
             from .segmentation import segment
 
-            regions = segment(photo.pixels, arguments.segment, arguments.regions, settings.seed, line.progress)
+            def warn(text: str) -> None:
+                photo.warnings.append(text)
+                line.say(f"warning: {text}")
+
+            chosen = arguments.segment, arguments.regions, settings.seed
+            regions = segment(photo.pixels, *chosen, line.progress, warn, arguments.weights)
         add_geometry(regions, corners, measures, photo.scale)
         seconds["regions"] = time.perf_counter() - start
 

@@ -53,7 +53,8 @@ def main() -> None:
     within, between, mean = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + COLLAGES):
         truth = collage(choices, seed, recolour=RECOLOUR)
-        statistics, found = features.measure(truth.pixels, lambda fraction, message: None)
+        found = features.measure(truth.pixels, lambda fraction, message: None)
+        statistics = features.smoothed_plainly(found.statistics, found)
         labels = cv2.resize(truth.labels.astype(np.uint8), found.labels.shape[::-1], interpolation=cv2.INTER_NEAREST)
         counts = np.zeros((len(found.size), labels.max() + 1), int)
         np.add.at(counts, (found.labels.ravel(), labels.ravel()), 1)

@@ -1,14 +1,16 @@
 """Automatic regions: a photo to its materials' masks, by engines chosen by name."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import PaletteError
 from ..region import Region
-from .superpixels import segment_auto
+from .auto import segment_auto
+from .sam import segment_sam
 
-SEGMENTERS = {"auto": segment_auto}
+SEGMENTERS = {"auto": segment_auto, "sam": segment_sam}
 MOST_REGIONS = 32
 
 
@@ -18,17 +20,20 @@ def segment(
     regions: int = 6,
     seed: int = 0,
     progress: Callable[[float, str], None] = lambda fraction, message: None,
+    warn: Callable[[str], None] = lambda text: None,
+    weights: str | Path | None = None,
 ) -> list[Region]:
     """At most `regions` regions of a photo (H, W, 3) linear float32, disjoint, by decreasing area.
 
-    They need not cover the photo: what is too small to hold a texture is left out.
+    They need not cover the photo: what is too small to hold a texture or no surface is left out, and `warn` told.
+    `weights` is the folder of an engine that doesn't bring its own ("sam").
     Raises PaletteError for an unknown engine, a number of regions outside 1..32, or a photo without any region.
     """
     if engine not in SEGMENTERS:
         raise PaletteError(f"There is no segmentation '{engine}'; there is: {', '.join(sorted(SEGMENTERS))}.")
     if not 1 <= regions <= MOST_REGIONS:
         raise PaletteError(f"The number of regions is {regions}; it must be from 1 to {MOST_REGIONS}.")
-    found = SEGMENTERS[engine](photo_pixels, regions, seed, progress)
+    found = SEGMENTERS[engine](photo_pixels, regions, seed, progress, warn, weights)
     if not found:
         raise PaletteError(
             f"Segmentation '{engine}' found no region large enough for a texture. Use a larger photo or paint masks."

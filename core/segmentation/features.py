@@ -26,6 +26,7 @@ SUPERPIXELS = 1600
 SLIC_RULER = 10.0  # weight of compactness against colour
 SLIC_STEPS = 6
 BANDS = (1, 2, 4, 8)  # px
+BAND_COLUMNS = slice(6, 10)  # of the statistics: the logarithm of each band's contrast
 EDGE_SCALES = (1, 3)  # px
 DARKEST = 8.0  # of L; below it contrast is the camera's noise
 PLAIN_ROUNDS, ALIKE_ROUNDS = 2, 8  # of smoothing over the graph of superpixels
@@ -34,28 +35,31 @@ PLAIN_ROUNDS, ALIKE_ROUNDS = 2, 8  # of smoothing over the graph of superpixels
 @dataclass
 class Features:
     """A photo's superpixels. shape: (H, W) of the photo; labels (h, w) int, 0..n-1, of the reduced photo; lab (h, w, 3)
-    float32 CIELAB of it; size (n,) px; vectors (n, d) float32; borders (m, 3) int: a < b that touch, length in px."""
+    float32 CIELAB of it; size (n,) px; borders (m, 3) int: a < b that touch, length in px; statistics (n, s) float32;
+    vectors (n, d) float32."""
 
     shape: tuple[int, int]
     labels: np.ndarray
     lab: np.ndarray
     size: np.ndarray
-    vectors: np.ndarray
     borders: np.ndarray
+    statistics: np.ndarray
+    vectors: np.ndarray
 
 
 def describe(pixels: np.ndarray, progress: Callable[[float, str], None] = lambda fraction, message: None) -> Features:
     """Features of a photo (H, W, 3) linear float32."""
     progress(0.0, "Looking at the photo")
-    statistics, features = measure(pixels, progress)
+    features = measure(pixels, progress)
     discriminant = _discriminant()
-    features.vectors = smoothed((statistics - discriminant["mean"]) @ discriminant["projection"], features)
+    vectors = (features.statistics - discriminant["mean"]) @ discriminant["projection"]
+    features.vectors = smoothed(smoothed_plainly(vectors, features), features)
     progress(1.0, "Looking at the photo")
     return features
 
 
-def measure(pixels: np.ndarray, progress: Callable[[float, str], None]) -> tuple[np.ndarray, Features]:
-    """(n, s) statistics of the superpixels of a photo, smoothed over neighbours, and its features without vectors."""
+def measure(pixels: np.ndarray, progress: Callable[[float, str], None]) -> Features:
+    """Features of a photo without vectors."""
     rgb = _reduced(pixels)
     lab = cv2.cvtColor(np.clip(srgb_from_linear(rgb), 0, 1), cv2.COLOR_RGB2LAB)
     labels = _superpixels(lab, lambda fraction: progress(0.1 + 0.4 * fraction, "Looking at the photo"))
@@ -68,11 +72,16 @@ def measure(pixels: np.ndarray, progress: Callable[[float, str], None]) -> tuple
         columns.append(mean)
         deviations.append(np.sqrt(np.maximum(square - mean**2, 0)))
         progress(min(0.9, 0.5 + 0.015 * index), "Looking at the photo")
-    features = Features(pixels.shape[:2], labels, lab, size, np.empty((len(size), 0)), _borders(labels))
     statistics = np.stack(columns + deviations, 1).astype(np.float32)
+    nothing = np.empty((len(size), 0), np.float32)
+    return Features(pixels.shape[:2], labels, lab, size, _borders(labels), statistics, nothing)
+
+
+def smoothed_plainly(vectors: np.ndarray, features: Features) -> np.ndarray:
+    """(n, d) vectors averaged over all neighbours."""
     for _ in range(PLAIN_ROUNDS):
-        statistics = _round(statistics, features, None)
-    return statistics, features
+        vectors = _round(vectors, features, None)
+    return vectors
 
 
 def smoothed(vectors: np.ndarray, features: Features) -> np.ndarray:

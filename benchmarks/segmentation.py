@@ -1,0 +1,251 @@
+#!/usr/bin/env python3
+"""Regions against true masks: `auto` and `pick` beside their opponents, on the same photos in one run.
+
+    python benchmarks/segmentation.py DATA -o benchmarks/results/segmentation/     about 20 minutes on one core
+    python benchmarks/segmentation.py DATA -o DIR --only auto stability     some of: auto pick stability time sheet
+
+DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages are made of textures of the test split,
+which nothing was fitted on; no scene and none of its materials was either. Writes segmentation.csv, a row per measure,
+photo and method, as it goes (a second call goes on where the first ended), segmentation.json and sheet.jpg.
+"""
+
+import argparse
+import csv
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import dev  # noqa: E402
+
+dev.load_package()
+from material_palette.benchmarks import regions as measures  # noqa: E402
+from material_palette.benchmarks.collage import collage, scenes, sources  # noqa: E402
+from material_palette.core.errors import PaletteError  # noqa: E402
+from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
+from material_palette.core.segmentation import segment  # noqa: E402
+from material_palette.core.segmentation.features import describe  # noqa: E402
+from material_palette.core.segmentation.pick import Click, select  # noqa: E402
+
+COLLAGES = 12
+BOUND = 6  # the user's upper bound, as by default
+SHOWN = ("kodak_", "azure_")  # photos that may be shown
+PARTS = ("auto", "stability", "pick", "time", "sheet")
+
+
+def ours(pixels: np.ndarray, count: int) -> np.ndarray:
+    labels = np.full(pixels.shape[:2], -1)
+    try:
+        for index, region in enumerate(segment(pixels, regions=BOUND)):
+            labels[region.mask] = index
+    except PaletteError:
+        pass
+    return labels
+
+
+WHOLE = {"ours, auto": ours, **measures.WHOLE}
+
+
+def changed(pixels: np.ndarray, truth: np.ndarray):
+    """(name, photo, its labels): what cameras and files do to a photo."""
+    encoded = np.round(255 * np.clip(srgb_from_linear(pixels), 0, 1)).astype(np.uint8)
+    jpeg = cv2.imdecode(cv2.imencode(".jpg", encoded, [cv2.IMWRITE_JPEG_QUALITY, 30])[1], cv2.IMREAD_COLOR)
+    yield "JPEG 30", linear_from_srgb(jpeg / np.float32(255)), truth
+    noise = np.random.default_rng(0).normal(0, 0.03, encoded.shape)
+    yield "noise 3 %", linear_from_srgb(np.clip(encoded / 255 + noise, 0, 1)), truth
+    yield "blur 1.5 px", cv2.GaussianBlur(pixels, (0, 0), 1.5), truth
+    for stops in (-2, 2):
+        yield f"{stops:+} EV", np.clip(pixels * np.float32(2.0**stops), 0, 1), truth
+    for scale in (0.5, 2):
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        size = {"dsize": None, "fx": scale, "fy": scale}
+        resized = cv2.resize(pixels, interpolation=method, **size).clip(0)
+        labels = cv2.resize(truth.astype(np.int16), interpolation=cv2.INTER_NEAREST, **size)
+        yield f"scale x{scale}", resized, labels.astype(int)
+
+
+class Table:
+    """Rows on disk: (part, photo, method, measure, value); what is there is not measured again."""
+
+    def __init__(self, path: Path):
+        self.path, self.rows = path, []
+        if path.exists():
+            with path.open(newline="", encoding="utf-8") as file:
+                self.rows = [tuple(row) for row in csv.reader(file)][1:]
+        self.done = {row[:3] for row in self.rows}
+
+    def add(self, part: str, photo: str, method: str, **values: float) -> None:
+        new = [(part, photo, method, measure, f"{value:.5g}") for measure, value in values.items()]
+        first = not self.path.exists()
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            if first:
+                writer.writerow(("part", "photo", "method", "measure", "value"))
+            writer.writerows(new)
+        self.rows += new
+        self.done.add((part, photo, method))
+
+    def summary(self) -> dict:
+        found = defaultdict(list)
+        for part, photo, method, measure, value in self.rows:
+            found[part, photo.split("_")[0] if part != "time" else photo, method, measure].append(float(value))
+        return {
+            " | ".join(key): {
+                "median": round(float(np.median(values)), 4),
+                "quartiles": [round(float(q), 4) for q in np.quantile(values, (0.25, 0.75))],
+                "mean": round(float(np.mean(values)), 4),
+                "n": len(values),
+            }
+            for key, values in found.items()
+        }
+
+
+def whole_photos(table: Table, photos: list) -> None:
+    for photo in photos:
+        count = photo.labels.max() + 1
+        for name, method in WHOLE.items():
+            if ("auto", photo.name, name) not in table.done:
+                start = time.process_time()
+                labels = method(photo.pixels, count)
+                table.add(
+                    "auto",
+                    photo.name,
+                    name,
+                    iou=measures.mean_iou(labels, photo.labels),
+                    boundary_f=measures.boundary_f(labels, photo.labels),
+                    count_error=abs(labels.max() + 1 - count),
+                    cpu_seconds=time.process_time() - start,
+                )
+
+
+def stability(table: Table, photos: list) -> None:
+    for photo in photos:
+        for name, pixels, truth in changed(photo.pixels, photo.labels):
+            if ("stability", photo.name, name) not in table.done:
+                labels = ours(pixels, 0)
+                table.add("stability", photo.name, name, iou=measures.mean_iou(labels, truth))
+
+
+def clicks(table: Table, photos: list, most: int = 3) -> None:
+    for photo in photos:
+        methods = {**measures.CLICKED, "ours, pick": None, "ours, pick, best tolerance": None}
+        for name in methods:
+            if ("pick", photo.name, name) in table.done:
+                continue
+            features = describe(photo.pixels) if methods[name] is None else None
+            scores = np.zeros((photo.labels.max() + 1, most))
+            for material in range(len(scores)):
+                truth = photo.labels == material
+                given = [measures.first_click(truth, np.random.default_rng(material))]
+                for number in range(most):
+                    if features is None:
+                        mask = methods[name](photo.pixels, given)
+                    else:
+                        tolerances = np.linspace(0.15, 1, 18) if "best" in name else (0.5,)
+                        tried = [select(features, [Click(*click) for click in given], t) for t in tolerances]
+                        mask = max(tried, key=lambda mask: measures.iou(mask, truth))
+                    scores[material, number] = measures.iou(mask, truth)
+                    click = measures.next_click(truth, mask)
+                    if click is None:
+                        scores[material, number:] = 1.0
+                        break
+                    given.append(click)
+            values = {f"iou_{number + 1}": scores[:, number].mean() for number in range(most)}
+            table.add("pick", photo.name, name, **values)
+
+
+def times(table: Table, data: Path) -> None:
+    """Of a real photo enlarged to 2 megapixels, each in a process of its own."""
+    for part in ("auto", "pick"):
+        if ("time", part, "ours") not in table.done:
+            command = [sys.executable, __file__, str(data), "-o", str(table.path.parent), "--measure", part]
+            wall, cpu, change, megabytes = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+            table.add("time", part, "ours", wall_s=wall, cpu_s=cpu, change_ms=change, peak_mb=megabytes)
+
+
+def measure_time(data: Path, part: str) -> None:
+    pixels = read_photo(data / "photos" / "azure_colmar.jpg").pixels
+    pixels = cv2.resize(pixels, (1632, 1224), interpolation=cv2.INTER_CUBIC).clip(0)
+    describe(pixels[:64, :64])
+    wall, cpu = time.perf_counter(), time.process_time()
+    change = 0.0
+    if part == "auto":
+        segment(pixels)
+    else:
+        features = describe(pixels)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    if part == "pick":
+        start = time.process_time()
+        for number in range(20):
+            select(features, [Click(800, 600), Click(100, 100, False)], number / 20)
+        change = 1000 * (time.process_time() - start) / 20
+    megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps([wall, cpu, change, megabytes]))
+
+
+def sheet(data: Path, folder: Path, every: bool) -> None:
+    """Photo and regions side by side; beside the sheet the words about what was left out."""
+    tiles, words = [], []
+    for path in sorted((data / "photos").glob("*.jpg")):
+        if not every and not path.name.startswith(SHOWN):
+            continue
+        pixels = read_photo(path).pixels
+        regions = segment(pixels, regions=BOUND, warn=lambda text, path=path: words.append(f"{path.stem}: {text}"))
+        image = np.round(255 * np.clip(srgb_from_linear(pixels), 0, 1)).astype(np.uint8)[..., ::-1]
+        drawn = image // 4
+        for index, region in enumerate(regions):
+            hue = np.uint8([[[index * 180 // BOUND, 220, 255]]])
+            colour = cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0]
+            drawn[region.mask] = image[region.mask] // 2 + colour // 2
+        scale = 150 / image.shape[0]
+        small = [cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for x in (image, drawn)]
+        tile = np.zeros((154, 460, 3), np.uint8)
+        pair = np.hstack(small)[:150, :460]
+        tile[: pair.shape[0], : pair.shape[1]] = pair
+        tiles.append(tile)
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 3)
+    rows = [np.hstack(tiles[start : start + 3]) for start in range(0, len(tiles), 3)]
+    cv2.imwrite(str(folder / ("every.png" if every else "sheet.jpg")), np.vstack(rows))
+    (folder / ("every.txt" if every else "sheet.txt")).write_text("\n".join(words) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--collages", type=int, default=COLLAGES)
+    parser.add_argument("--every-photo", action="store_true", help="all photos on the sheet, not only those to share")
+    parser.add_argument("--measure", choices=("auto", "pick"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.measure:
+        measure_time(arguments.data, arguments.measure)
+        return
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    table = Table(arguments.output / "segmentation.csv")
+    choices = sources(arguments.data, "test")
+    photos = scenes(arguments.data) + [collage(choices, seed) for seed in range(arguments.collages)]
+    for photo in photos[:8]:
+        photo.name = "scene_" + photo.name
+    for part, run in (("auto", whole_photos), ("stability", stability), ("pick", clicks)):
+        if part in arguments.only:
+            run(table, photos if part != "stability" else photos[::2])
+    if "time" in arguments.only:
+        times(table, arguments.data)
+    if "sheet" in arguments.only:
+        sheet(arguments.data, arguments.output, arguments.every_photo)
+    text = json.dumps(table.summary(), indent=1)
+    (arguments.output / "segmentation.json").write_text(text + "\n", encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
