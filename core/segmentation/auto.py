@@ -240,7 +240,7 @@ def _masks(
         soft = cv2.resize(soft, shape[::-1], interpolation=cv2.INTER_LINEAR)
         owner[soft > best] = index
         np.maximum(best, soft, out=best)
-        progress(0.9 + 0.04 * (index + 1) / len(ids), "Segmenting")
+        progress(0.9 + 0.039 * (index + 1) / len(ids), "Segmenting")
     for index, region in enumerate(ids):
         if region >= 0:
             yield index / len(ids), int(region), owner == index
