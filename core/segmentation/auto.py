@@ -10,7 +10,7 @@
 3. Merge any two, wherever they lie, by the squared distance of their mean vectors and the same size term, so that
    islands of one material become one region. It goes on below the user's bound while two are as near as parts of one
    material are: vectors have deviation 1 along each direction within a material, so that limit is one number.
-4. What holds no texture of a surface is left out and said: too thin, sky, overexposed.
+4. What holds no texture of a surface is left out and said: too thin, blue sky, overexposed.
 """
 
 import heapq
@@ -31,6 +31,7 @@ TOUCHING_UNTIL = 40  # regions; from there on regions that don't touch may merge
 ONE_MATERIAL = 16.0  # squared distance of two regions' vectors; below it they are one material
 LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and are left out
 OVEREXPOSED = 99.0  # L of white
+SKY_BLUE = 8.0  # -b
 SMOOTH = -3.6  # logarithm of a band's contrast; below it there is nothing but the camera's noise
 
 
@@ -222,8 +223,7 @@ def _no_surface(features: Features, inside: np.ndarray) -> str | None:
     bands = np.average(features.statistics[inside][:, BAND_COLUMNS], axis=0, weights=size)
     top = inside[features.labels[0]].mean()
     lightness, blueness = np.median(pixels[:, 0]), -np.median(pixels[:, 2])
-    bright = lightness > 1.15 * np.median(features.lab[..., 0]) or blueness > 10
-    if bands[0] < SMOOTH and top > 0.2 and bright and lightness > 50:
+    if bands[0] < SMOOTH and top > 0.2 and blueness > SKY_BLUE and lightness > 50:  # a bright wall is no sky
         return "looks like sky"
     return None
 
