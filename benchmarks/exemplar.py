@@ -340,7 +340,8 @@ def write_chart(summary: dict, folder: Path) -> None:
             place.set_ylabel(label)
             place.set_ylim(bottom=0)
             place.grid(lw=0.3, alpha=0.5)
-            place.legend(fontsize=7)
+            if place.lines:
+                place.legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(folder / "exemplar.svg", metadata={"Date": None})
     figure.savefig(folder / "exemplar.png", dpi=110, metadata={"Software": None})
