@@ -6,7 +6,8 @@
 
 DATA is a folder with textures/<name>.jpg; the regions of examples/*/masks always take part. Writes texture.csv (a row
 per engine, exemplar and seed), texture.json (machine, command, summary), texture.svg and .png (the chart) and
-texture.jpg (the contact sheet). Needs requirements-benchmarks.txt besides requirements.txt.
+texture.jpg (the contact sheet). Engines whose results are in the output's parts/ are not run again: an interrupted run
+goes on; delete parts/ to measure anew. Needs requirements-benchmarks.txt besides requirements.txt.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -37,6 +38,8 @@ from material_palette.benchmarks import baselines, measures  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402
 from material_palette.core.image import read_mask, read_photo, srgb_from_linear  # noqa: E402
+from material_palette.core.perceptual import Crops  # noqa: E402
+from material_palette.core.tensors import read_tensors, write_tensors  # noqa: E402
 from material_palette.core.torus import WRAP_GATE, wrap_ratio  # noqa: E402
 
 TEXTURES = (
@@ -82,6 +85,7 @@ COLUMNS = (
     ("cpu_seconds", "CPU s", 1, 2),
     ("swd", "SWD x 1000", 1000, 1),
     ("sifid", "SIFID x 1000", 1000, 1),
+    ("lpips", "ST-LPIPS", 1, 3),
     ("repetition_excess", "repetition above the exemplar's", 1, 2),
     ("wrap_ratio", "wrap ratio", 1, 2),
     ("copied_share", "verbatim share", 1, 2),
@@ -204,10 +208,11 @@ class Judge:
                 measures.patch_quantiles(e.pixels, e.mask),
                 measures.repetition(e.pixels, e.mask),
                 self.vgg and measures.feature_statistics(self.vgg, e.pixels, e.mask),
+                Crops(e.pixels, e.mask),
             )
 
     def __call__(self, name: str, texture: np.ndarray, coordinates: np.ndarray | None) -> dict:
-        quantiles, own, features = self.of[name]
+        quantiles, own, features, crops = self.of[name]
         repetition = measures.repetition(texture)
         sifid = ""
         if self.vgg:
@@ -215,6 +220,7 @@ class Judge:
         return {
             "swd": measures.sliced_wasserstein(measures.patch_quantiles(texture), quantiles),
             "sifid": sifid,
+            "lpips": crops.distance(texture) if crops.found else "",
             "repetition": repetition,
             "repetition_excess": repetition - own,
             "wrap_ratio": wrap_ratio(texture),
@@ -222,29 +228,47 @@ class Judge:
         }
 
 
-def run(engines: list[str], exemplars: list[Exemplar], seeds: int, size: int) -> tuple[list[dict], dict]:
-    """Rows of the CSV, and the first seed's textures by (engine, exemplar)."""
-    judge = Judge(exemplars)
-    rows, textures = [], {}
+def run(engines: list[str], exemplars: list[Exemplar], seeds: int, size: int, parts: Path, measured: str):
+    """Rows of the CSV, the first seed's textures by (engine, exemplar), and the commit each engine was measured at.
+
+    What is done is kept in `parts`, a file per engine, and taken from there the next time.
+    """
+    judge = None
+    parts.mkdir(parents=True, exist_ok=True)
 
     def collect(engine: str, made: dict) -> None:
+        rows, textures = [], {}
         for name, seed, texture, coordinates, cpu, wall in made["results"]:
             row = {"engine": engine, "exemplar": name, "seed": seed, "size": len(texture)}
             row |= {"cpu_seconds": cpu, "wall_seconds": wall} | judge(name, texture, coordinates)
             row |= {"peak_mb": made["peak"], "imports_mb": made["before"]}
             rows.append({k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()})
             if seed == 0:
-                textures[engine, name] = texture
+                textures[name] = np.ascontiguousarray(texture, np.float32)
+        write_tensors(parts / f"{engine}.safetensors", textures)
+        part = {"commit": measured, "size": size, "seeds": seeds, "rows": rows}
+        (parts / f"{engine}.json").write_text(json.dumps(part, indent=1), encoding="utf-8")
 
-    for engine in (e for e in engines if e not in LIMITS):
+    todo = [e for e in engines if not (parts / f"{e}.json").exists()]
+    if todo:
+        judge = Judge(exemplars)
+    for engine in (e for e in todo if e not in LIMITS):
         collect(engine, in_process(engine, exemplars, seeds, size))
-    slow = [e for e in LIMITS if e in engines]
+    slow = [e for e in LIMITS if e in todo]
     with ThreadPoolExecutor(2) as pool:
-        made = list(pool.map(lambda engine: in_process(engine, exemplars, seeds, size), slow))
-    for engine, results in zip(slow, made, strict=True):
-        collect(engine, results)
-    rows.sort(key=lambda row: engines.index(row["engine"]))
-    return rows, textures
+        made = {pool.submit(in_process, engine, exemplars, seeds, size): engine for engine in slow}
+        for future in as_completed(made):
+            collect(made[future], future.result())
+    rows, textures, commits = [], {}, {}
+    for engine in engines:
+        part = json.loads((parts / f"{engine}.json").read_text(encoding="utf-8"))
+        if (part["size"], part["seeds"]) != (size, seeds):
+            raise SystemExit(f"'{parts / engine}.json' is of another size or number of seeds; delete it")
+        rows += part["rows"]
+        commits[engine] = part["commit"]
+        if (parts / f"{engine}.safetensors").exists():
+            textures |= {(engine, n): t for n, t in read_tensors(parts / f"{engine}.safetensors")[0].items()}
+    return rows, textures, commits
 
 
 # ---------------------------------------------------------------- results
@@ -273,18 +297,23 @@ def summarise(rows: list[dict]) -> dict:
     return summary
 
 
+DUELS = ("cpu_seconds", "swd", "sifid", "lpips")
+
+
 def duel(rows: list[dict], engine: str) -> dict | None:
     """On the exemplars the engine was run on: medians of both, and the share on which `balanced` is no worse."""
     by = defaultdict(list)
     for row in rows:
-        for column in ("cpu_seconds", "swd", "sifid"):
+        for column in DUELS:
             if row[column] != "":
                 by[row["engine"], column, row["exemplar"]].append(row[column])
     result = {}
-    for column in ("cpu_seconds", "swd", "sifid"):
+    for column in DUELS:
         names = [n for e, c, n in by if (e, c) == (engine, column) and ("balanced", c, n) in by]
-        if not names or engine == "balanced":
+        if engine == "balanced":
             return None
+        if not names:
+            continue
         theirs = np.array([np.median(by[engine, column, n]) for n in names])
         ours = np.array([np.median(by["balanced", column, n]) for n in names])
         result[column] = {
@@ -302,7 +331,7 @@ def markdown(summary: dict) -> str:
     for engine, entry in summary.items():
         cells = [LABELS[engine], str(entry["textures"])]
         for column, _, factor, decimals in COLUMNS:
-            q = entry[column]
+            q = entry.get(column)
             cells.append("" if q is None else f"{q[1] * factor:.{decimals}f}")
             if q is not None and column in ("swd", "sifid"):
                 cells[-1] += f" ({q[0] * factor:.{decimals}f} to {q[2] * factor:.{decimals}f})"
@@ -416,7 +445,8 @@ def main(arguments: list[str] | None = None) -> int:
     exemplars = read_exemplars(options.data, options.size, options.quick)
     options.output.mkdir(parents=True, exist_ok=True)
     start, measured = time.time(), commit()
-    rows, textures = run(engines, exemplars, options.seeds, options.size)
+    parts = options.output / "parts"
+    rows, textures, commits = run(engines, exemplars, options.seeds, options.size, parts, measured)
     summary = summarise(rows)
     with open(options.output / "texture.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
@@ -425,7 +455,7 @@ def main(arguments: list[str] | None = None) -> int:
     command = ["DATA" if options.data and a == str(options.data) else a for a in arguments or sys.argv[1:]]
     facts = {
         "command": " ".join(["benchmarks/texture.py", *command]),
-        "commit": measured,
+        "commits": commits,
         "machine": machine(),
         "minutes": round((time.time() - start) / 60, 1),
         "size": options.size,
