@@ -2,6 +2,9 @@
 
 A network with strides sees a texture differently after it is rolled by a pixel. So the texture is first rolled to an
 origin that its content decides, and the maps are rolled back: then rolling the texture rolls the maps, bit for bit.
+
+Roughness is the material's mean, a value: what the network says of its variation is no better than none on materials
+it was not trained on (`models/svbrdf_net.md`).
 """
 
 import os
@@ -41,15 +44,14 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weigh
         out = _tiled(net, encoded, context, progress)
         mean = net.mean_roughness(context).clamp(0.05, 1).item()
     progress(0.8, "integrating the height")
-    gain, slope, varied = out[..., :3], out[..., 3:5].clamp(-STEEPEST, STEEPEST), out[..., 5]
+    gain, slope = out[..., :3], out[..., 3:].clamp(-STEEPEST, STEEPEST)
     albedo = (torch.from_numpy(texture).clamp_min(DARKEST) * torch.exp(gain)).clamp(0, 1)
     height = integrate(slope[..., 0], slope[..., 1]) / texture.shape[1]
     progress(0.9, "computing normals")
-    roughness = (mean + varied - varied.mean()).clamp(0, 1)
-    maps = (albedo, normal_from_height(height), roughness, height)
-    albedo, normal, roughness, height = (x.roll(origin, (0, 1)).numpy() for x in maps)
+    maps = (albedo, normal_from_height(height), height)
+    albedo, normal, height = (x.roll(origin, (0, 1)).numpy() for x in maps)
     progress(1.0, "computing normals")
-    return SVBRDF(albedo, normal, roughness, height)
+    return SVBRDF(albedo, normal, mean, height)
 
 
 @cache
@@ -82,9 +84,9 @@ def _overview(encoded: np.ndarray) -> torch.Tensor:
 
 
 def _tiled(net: SvbrdfNet, encoded: np.ndarray, context: torch.Tensor, progress) -> torch.Tensor:
-    """What the network says of every pixel, (H, W, 6); tiles with a halo of what surrounds them on the torus."""
+    """Gain and slope of every pixel, (H, W, 5); tiles with a halo of what surrounds them on the torus."""
     height, width = encoded.shape[:2]
-    out = torch.empty(height, width, 6)
+    out = torch.empty(height, width, 5)
     corners = [(top, left) for top in range(0, height, TILE[0]) for left in range(0, width, TILE[1])]
 
     def tile(corner: tuple[int, int]) -> None:
@@ -96,7 +98,7 @@ def _tiled(net: SvbrdfNet, encoded: np.ndarray, context: torch.Tensor, progress)
         pixels = torch.from_numpy(encoded[rows[:, None], columns[None]]).permute(2, 0, 1)[None]
         with torch.no_grad():
             found = net(pixels.contiguous(memory_format=torch.channels_last), context)
-        inner = torch.cat(list(found.values()), 1)[0, :, HALO : HALO + h, HALO : HALO + w]
+        inner = torch.cat([found["gain"], found["slope"]], 1)[0, :, HALO : HALO + h, HALO : HALO + w]
         out[top : top + h, left : left + w] = inner.permute(1, 2, 0)
 
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
@@ -104,7 +106,7 @@ def _tiled(net: SvbrdfNet, encoded: np.ndarray, context: torch.Tensor, progress)
         try:
             for i, done in enumerate(tiles):
                 done.result()
-                progress(0.05 + 0.7 * (i + 1) / len(corners), "separating albedo, relief and roughness")
+                progress(0.05 + 0.7 * (i + 1) / len(corners), "separating albedo and relief")
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
