@@ -82,6 +82,7 @@ class Level:
     valid: torch.Tensor  # (h * w) bool, the sources: pixels whose patch lies in the region
     basis: torch.Tensor  # (D, 3, PATCH, PATCH)
     features: torch.Tensor  # (h * w, D), the patch around each pixel projected on the basis
+    ranked: torch.Tensor  # (D, n), the features of at most RANKED sources, for `_match`
     shape: tuple[int, int]
 
 
@@ -156,7 +157,8 @@ def _level(colour: torch.Tensor, weight: torch.Tensor) -> Level | None:
     _, vectors = torch.linalg.eigh(centred.T @ centred)
     basis = (vectors[:, -COMPONENTS:].T * window.repeat(3)).reshape(-1, 3, PATCH, PATCH)
     features = F.conv2d(pixels, basis, padding=RADIUS)[0].flatten(1).T.contiguous()
-    return Level(flat.T.contiguous(), inside.flatten(), valid, basis, features, tuple(pixels.shape[2:]))
+    ranked = features[sources[:: -(-len(sources) // RANKED)]].T
+    return Level(flat.T.contiguous(), inside.flatten(), valid, basis, features, ranked, tuple(pixels.shape[2:]))
 
 
 def _window() -> torch.Tensor:
@@ -436,22 +438,25 @@ def _match(level: Level, image: torch.Tensor, times: int, generator: torch.Gener
     """
     h, w = image.shape[:2]
     average = 1 / _window().square().sum()
-    features = level.features[level.valid]
-    features = features[:: -(-len(features) // RANKED)].T
     for done in range(times):
         turn, _ = torch.linalg.qr(torch.randn(COMPONENTS, COMPONENTS, generator=generator))
         basis = (turn @ level.basis.flatten(1)).reshape(level.basis.shape)
-        low, step, moves = _moves(_quantiles(_some_components(image, basis, generator)), _quantiles(turn @ features))
+        low, step, moves = _moves(
+            _quantiles(_some_components(image, basis, generator)), _quantiles(turn @ level.ranked)
+        )
         moved = torch.empty_like(image)
 
-        def move(number, top, end, image=image, basis=basis, low=low, step=step, moves=moves, moved=moved) -> None:
+        # into bins by the convolution itself, and back by its adjoint
+        forth, offset = basis / step[..., None], (-low / step).flatten()
+        back = (average * basis).flip(2, 3).transpose(0, 1).contiguous(memory_format=torch.channels_last)
+
+        def move(number, top, end, image=image, forth=forth, offset=offset, back=back, moves=moves, moved=moved):
             wide = _with_halo(image, top, end, 2 * RADIUS).permute(2, 0, 1)[None]
-            wide = F.pad(wide, (2 * RADIUS, 2 * RADIUS, 0, 0), mode="circular")
-            values = F.conv2d(wide, basis)[0]
-            bins = ((values - low) / step).clamp_(0, QUANTILES - 1).long()
-            by = moves.gather(1, bins.flatten(1)).reshape(1, *values.shape)
-            by = F.conv_transpose2d(by, basis, padding=2 * RADIUS)[0].permute(1, 2, 0)
-            moved[top:end] = image[top:end] + average * by
+            wide = F.pad(wide, (2 * RADIUS, 2 * RADIUS, 0, 0), mode="circular").contiguous()
+            bins = F.conv2d(wide, forth, offset)[0].clamp_(0, QUANTILES - 1)
+            by = moves.gather(1, bins.flatten(1).long()).reshape(1, *bins.shape)
+            by = F.conv2d(by.contiguous(memory_format=torch.channels_last), back)[0].permute(1, 2, 0)
+            torch.add(image[top:end], by, out=moved[top:end])
 
         _each_band((h, w), move, pool, lambda fraction, done=done: report((done + fraction) / times))
         image = moved
