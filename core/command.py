@@ -31,6 +31,8 @@ def main(argv: list[str]) -> int:
         return BAD_INPUT
     codes = [0]
     try:
+        if arguments.command == "resample":
+            return _resample(arguments)
         for photo, masks, folder in _jobs(arguments):
             try:
                 codes.append(_extract(photo, masks, folder, arguments))
@@ -48,7 +50,7 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("material_palette", description="Tileable PBR materials from a photo's regions.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="extract")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="extract | resample")
     extract = commands.add_parser("extract", help="make a palette of each photo")
     extract.add_argument("photos", nargs="+", type=Path, metavar="PHOTO", help="image file; several make a folder each")
     where = extract.add_mutually_exclusive_group(required=True)
@@ -63,12 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     extract.add_argument("--weights", type=Path, metavar="DIR", help="folder of Segment Anything's weights")
     extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
     extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
-    extract.add_argument(
-        "--decomposer", default="unet", help="unet (a network), analytic, or resnet101=FILE (%(default)s)"
-    )
-    extract.add_argument("--quality", default="balanced", help="draft, balanced or best (%(default)s)")
-    extract.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
-    extract.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
+    extract.add_argument("--keep-concepts", action="store_true", help="keep what was learnt, for `resample`")
     extract.add_argument("--metres-per-tile", type=float, default=1.0, metavar="M", help="size of a repeat (1)")
     extract.add_argument(
         "--rectify", default="auto", help="slanted regions: auto, quad (only by corners) or off (auto)"
@@ -89,8 +86,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
     extract.add_argument("--white-balance", default="off", help="off, or region: the region is grey on average (off)")
-    extract.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
-    extract.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
     diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)")
     diffusion.add_argument("--model", default="", help="folder in diffusers' format, .safetensors checkpoint or hub id")
     diffusion.add_argument("--online", action="store_true", help="fetch the model from the hub if it is not here")
@@ -106,8 +101,57 @@ def _parser() -> argparse.ArgumentParser:
     diffusion.add_argument("--roll", default="noise", help="noise, feature (few steps) or none (%(default)s)")
     diffusion.add_argument("--roll-from", type=float, default=0.0, metavar="F", help="fraction of the steps (0)")
     diffusion.add_argument("--candidates", type=int, metavar="K", help="samples; the best is kept (1; at best: 4)")
-    extract.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
+    resample = commands.add_parser("resample", help="other textures of materials extracted with --keep-concepts")
+    resample.add_argument(
+        "concepts", nargs="+", type=Path, metavar="CONCEPT", help="NAME/NAME_concept.json in a palette's folder"
+    )
+    for each in (extract, resample):
+        each.add_argument(
+            "--decomposer", default="unet", help="unet (a network), analytic, or resnet101=FILE (%(default)s)"
+        )
+        each.add_argument("--quality", default="balanced", help="draft, balanced or best (%(default)s)")
+        each.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
+        each.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
+        each.add_argument("--scale", type=float, default=1.0, metavar="S", help="enlarge the texture S times (1)")
+        each.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
+        each.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
+        each.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
     return parser
+
+
+def _resample(arguments: argparse.Namespace) -> int:
+    from . import nodes
+    from .output import staged
+    from .palette import Palette, Settings, resample_material, write_palette
+    from .region import file_name
+
+    settings = Settings(
+        decomposer=arguments.decomposer,
+        quality=arguments.quality,
+        resolution=arguments.resolution,
+        seed=arguments.seed,
+        scale=arguments.scale,
+    )
+    settings.check()
+    for path in arguments.concepts:
+        if path.resolve().is_relative_to(arguments.output.resolve()):
+            raise PaletteError(f"'{path}' lies in the output folder, which would be replaced; name another folder")
+    with staged(arguments.output, arguments.overwrite) as staging:
+        palette = Palette(None, "saved concepts", [], settings, [])
+        for path in arguments.concepts:
+            line = _Line(path.name)
+            material = resample_material(path, settings, line.progress)
+            if file_name(material.name).casefold() in (file_name(other.name).casefold() for other in palette.materials):
+                raise PaletteError(f"two concepts are named '{material.name}'; resample them into separate folders")
+            palette.materials.append(material)
+            line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
+            for warning in material.warnings:
+                line.say(f"{material.name}: warning: {warning}")
+        content = write_palette(palette, staging)
+        previews = {material.name: material.preview for material in palette.materials}
+        nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
+    print(f"{len(palette.materials)} materials written to {arguments.output}", flush=True)
+    return DONE
 
 
 def _jobs(arguments: argparse.Namespace) -> list[tuple[Path, Path | None, Path]]:
@@ -143,6 +187,8 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         white_balance=arguments.white_balance,
         metres_per_tile=arguments.metres_per_tile,
         diffusion=_diffusion(arguments) if arguments.engine == "diffusion" else None,
+        scale=arguments.scale,
+        keep_concepts=arguments.keep_concepts,
     )
     settings.check()
     corners = dict(parse_corners(text) for text in arguments.corners)

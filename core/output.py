@@ -88,9 +88,9 @@ def _owned_files(target: Path, folder: str | Path, overwrite: bool) -> list[str]
     owned = list(PALETTE_FILES)
     for name, maps in records:
         name = file_name(name)
-        owned += [f"masks/{name}.png", f"exemplars/{name}.png", f"{name}/{name}.json"] + [
-            f"{name}/{name}_{kind}.png" for kind in MAPS
-        ]
+        owned += [f"masks/{name}.png", f"exemplars/{name}.png", f"{name}/{name}.json"]
+        owned += [f"{name}/{name}_{kind}.png" for kind in MAPS]
+        owned += [f"{name}/{name}_concept{suffix}" for suffix in (".json", ".safetensors")]
         for record in maps.values():
             listed = PurePosixPath(str(record.get("file", ""))) if isinstance(record, dict) else PurePosixPath()
             # palette.json may have been edited: only what lies straight in the material's folder can be its own

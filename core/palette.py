@@ -21,10 +21,15 @@ from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
+from .tensors import read_tensors, write_tensors
+from .torus import resize
 
 VERSION = 1  # of palette.json
 QUALITIES = tuple(engines.patch.PRESETS)
 RESOLUTION_RANGE = (64, 8192)
+SCALE_RANGE = (0.25, 8.0)
+LEAST_SAMPLED = 32  # px
+CONCEPT_VERSION = 1
 PREVIEW = 256  # px
 EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
@@ -38,8 +43,9 @@ class Settings:
     resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object,
     where a region's measure does not tell; rectify: "auto" brings a slanted region to the front, by its corners or by
     the plane that is found, "quad" by its corners only, "off" never; flatten takes slow changes of light and cast
-    shadows out of a region; white_balance "region" takes the region's mean for grey. diffusion: settings of the engine
-    of that name.
+    shadows out of a region; white_balance "region" takes the region's mean for grey. scale is how much larger the
+    texture is shown than the photo shows it; the tile's area shrinks by as much. keep_concepts: each material's concept
+    is kept and written, to sample others from. diffusion: settings of the engine of that name.
     """
 
     engine: str = "patch"
@@ -52,6 +58,8 @@ class Settings:
     white_balance: str = "off"
     metres_per_tile: float = 1.0
     diffusion: DiffusionSettings | None = None
+    scale: float = 1.0
+    keep_concepts: bool = False
 
     def check(self) -> None:
         """Raise PaletteError naming the first setting that cannot be honoured."""
@@ -75,6 +83,24 @@ class Settings:
             raise PaletteError(f"metres per tile is {self.metres_per_tile}; choose a positive length")
         if self.engine == "diffusion":
             (self.diffusion or DiffusionSettings()).check()
+            if self.keep_concepts:
+                raise PaletteError(
+                    "concepts of the engine 'diffusion' can't be kept beside the maps; name a folder of theirs "
+                    "(--concepts DIR), from which another extraction takes them, or leave --keep-concepts out"
+                )
+        least, most = SCALE_RANGE
+        if not least <= self.scale <= most:
+            raise PaletteError(f"scale {self.scale:g} is out of range; choose {least:g} to {most:g}")
+        if not LEAST_SAMPLED <= self.sampled <= RESOLUTION_RANGE[1]:
+            raise PaletteError(
+                f"resolution {self.resolution} px at scale {self.scale:g} needs a texture of {self.sampled} px; "
+                f"{LEAST_SAMPLED} to {RESOLUTION_RANGE[1]} can be made. Choose another resolution or scale"
+            )
+
+    @property
+    def sampled(self) -> int:
+        """Side in px of the texture at the photo's own scale."""
+        return round(self.resolution / self.scale)
 
 
 @dataclass
@@ -98,16 +124,18 @@ class Material:
     exemplar: np.ndarray | None = None
     texture: np.ndarray | None = None
     preview: np.ndarray | None = None
+    concept: tuple[dict[str, np.ndarray], dict] | None = None  # as engines save it; None: not asked for, or a constant
 
 
 @dataclass
 class Palette:
-    """photo (H, W, 3) float32 linear, its regions and, in the same order, their materials.
+    """photo (H, W, 3) float32 linear, its regions and, in the same order, their materials; photo None and no regions
+    where the materials were sampled from saved concepts.
 
     scale: px of the photo per px of its file.
     """
 
-    photo: np.ndarray
+    photo: np.ndarray | None
     photo_name: str
     regions: list[Region]
     settings: Settings
@@ -201,7 +229,7 @@ def extract_material(
         material.warnings += flat.warnings
         material.rectification = flat.record()
         if region.measure is not None:
-            material.metres_per_tile = settings.resolution * rectification.metres_per_texel(*region.measure, flat)
+            material.metres_per_tile = settings.sampled * rectification.metres_per_texel(*region.measure, flat)
     with _timed(seconds, "exemplar"):
         exemplar = _exemplar(flat, settings, _part(progress, 0.02, 0.03))
         encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
@@ -214,15 +242,66 @@ def extract_material(
     else:
         with _timed(seconds, "learn"):
             concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.03, learnt))
-        with _timed(seconds, "sample"):
-            size = settings.resolution, settings.resolution
-            texture = engine.sample(concept, size, settings.seed, _part(progress, learnt, 0.86), settings.quality)
-            material.warnings += getattr(texture, "warnings", [])
-            material.texture = sheet.thumbnail(np.tile(texture.pixels, (2, 2, 1)))
-        with _timed(seconds, "decompose"):
-            share = _part(progress, 0.86, 0.96)
-            svbrdf = decomposition.decompose(linear_from_srgb(texture.pixels), share, settings.decomposer)
+        if settings.keep_concepts:
+            tensors, facts = engine.to_tensors(concept)
+            facts |= {
+                "engine": settings.engine,
+                "metres_per_texel": material.metres_per_tile / settings.sampled,
+                "rectification": material.rectification,
+            }
+            material.concept = tensors, facts
+        svbrdf = _sample(material, engine, concept, settings, progress, learnt)
+    _finish(material, svbrdf, progress)
+    return material
 
+
+def resample_material(path: Path, settings: Settings, progress: Progress) -> Material:
+    """Another material of a concept that `write_material` saved: at another resolution, seed, quality or scale.
+
+    path: the concept's .json or .safetensors, which lie side by side. metres_per_tile follows from the concept.
+    Raises PaletteError for settings that cannot be honoured and for files that hold no concept.
+    """
+    settings.check()
+    progress(0.0, "reading the concept")
+    try:
+        path = path.with_suffix(".json")
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        if facts["version"] != CONCEPT_VERSION:
+            raise ValueError(f"version {facts['version']}, this extension reads {CONCEPT_VERSION}")
+        tensors, _ = read_tensors(path.with_suffix(".safetensors"))
+        engine = engines.open_engine(facts["engine"], None)
+        with _one_thread_each():
+            concept = engine.from_tensors(tensors, facts, _part(progress, 0.0, 0.06))
+        metres = float(facts["metres_per_texel"]) * settings.sampled
+        dataclasses.replace(settings, metres_per_tile=metres).check()
+        material = Material(facts["name"], metres_per_tile=metres, rectification=dict(facts["rectification"]))
+        file_name(material.name)
+    except PaletteError as error:
+        raise PaletteError(f"'{path}': {error}") from error
+    except OSError as error:
+        raise PaletteError(f"cannot read '{path}': {error.strerror or error}") from error
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise PaletteError(f"'{path}' holds no concept that can be read ({error}); extract it again") from error
+    with _one_thread_each():
+        _finish(material, _sample(material, engine, concept, settings, progress, 0.06), progress)
+    return material
+
+
+def _sample(material: Material, engine, concept, settings: Settings, progress: Progress, start: float) -> SVBRDF:
+    with _timed(material.seconds, "sample"):
+        size = settings.sampled, settings.sampled
+        texture = engine.sample(concept, size, settings.seed, _part(progress, start, 0.86), settings.quality)
+        material.warnings += getattr(texture, "warnings", [])
+        pixels = texture.pixels
+        if settings.sampled != settings.resolution:
+            pixels = np.clip(resize(pixels, (settings.resolution, settings.resolution)), 0, 1)
+        material.texture = sheet.thumbnail(np.tile(pixels, (2, 2, 1)))
+    with _timed(material.seconds, "decompose"):
+        return decomposition.decompose(linear_from_srgb(pixels), _part(progress, 0.86, 0.96), settings.decomposer)
+
+
+def _finish(material: Material, svbrdf: SVBRDF, progress: Progress) -> None:
+    seconds = material.seconds
     progress(0.97, "reducing the maps")
     with _timed(seconds, "reduce"):
         material.svbrdf, material.reduced = reduction.reduce(svbrdf)
@@ -230,7 +309,6 @@ def extract_material(
         sphere = brdf.render_sphere(material.svbrdf, PREVIEW)
         material.preview = np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
     progress(1.0, "done")
-    return material
 
 
 def preview_exemplar(
@@ -305,6 +383,10 @@ def write_material(material: Material, folder: Path) -> dict:
         # the 16 bits span the relief; height = (pixel - 0.5) * scale, in tile widths
         scale = max(2 * float(np.abs(svbrdf.height).max()), 1e-9)
         entry("height", 0.0, svbrdf.height / scale + 0.5, 16, scale=scale, midlevel=0.5)
+    if material.concept is not None:
+        tensors, facts = material.concept
+        write_tensors(folder / f"{name}_concept.safetensors", tensors)
+        _write_json(folder / f"{name}_concept.json", {"version": CONCEPT_VERSION, "name": material.name} | facts)
     _write_json(folder / f"{name}.json", record)
     return record
 
@@ -325,7 +407,8 @@ def write_palette(
         progress(0.8 * i / len(palette.materials), f"writing {material.name}")
         record = (written or {}).get(material.name)
         records.append(record or write_material(material, folder / file_name(material.name)))
-    (folder / "masks").mkdir()
+    if palette.regions:
+        (folder / "masks").mkdir()
     for region in palette.regions:
         write_image(folder / "masks" / f"{file_name(region.name)}.png", region.mask.astype(np.float32))
     _write_geometry(palette, folder / "masks")

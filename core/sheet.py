@@ -36,7 +36,7 @@ def thumbnail(encoded: np.ndarray) -> np.ndarray:
 def contact_sheet(palette: "Palette") -> np.ndarray:
     """The sheet as (H, W, 3) float32 sRGB-encoded: constants are shown as flat fields, a failure by its reason."""
     width = len(COLUMNS) * (CELL + GAP) + GAP
-    rows = [_photo(palette, width)]
+    rows = [] if palette.photo is None else [_photo(palette, width)]
     for i, material in enumerate(palette.materials):
         rows.append(_material(material, region_colour(i), width))
     return np.concatenate(rows)

@@ -9,6 +9,7 @@ from textures import pebbles
 
 pytest.importorskip("bpy", reason="palette.blend is written by Blender")
 from material_palette.core.command import main  # noqa: E402
+from material_palette.core.tensors import write_tensors  # noqa: E402
 
 
 @pytest.fixture
@@ -154,3 +155,62 @@ def test_several_photos_make_a_folder_each_and_a_bad_one_does_not_stop_the_rest(
     assert code == 2 and "broken.png" in capfd.readouterr().err
     assert (inputs / "out" / "photo" / "palette.blend").exists()
     assert not (inputs / "out" / "broken").exists()
+
+
+def test_a_kept_concept_gives_the_same_texture_again_and_others(inputs):
+    assert extract(inputs, "--keep-concepts") == 0
+    concepts = [str(inputs / f"out/{name}/{name}_concept.json") for name in "ab"]
+    assert main(["resample", *concepts, "--resolution", "96", "--quality", "draft", "-o", str(inputs / "again")]) == 0
+    first, again = (json.loads((inputs / f"{out}/palette.json").read_text())["materials"] for out in ("out", "again"))
+    assert [m["metres_per_tile"] for m in again] == [m["metres_per_tile"] for m in first]
+    assert [m["exemplar"] for m in again] == [None, None]
+    assert not (inputs / "again/exemplars").exists() and not (inputs / "again/masks").exists()
+    for name in "ab":
+        file = f"{name}/{name}_basecolor.png"
+        assert (inputs / "again" / file).read_bytes() == (inputs / "out" / file).read_bytes()
+    large = ["--resolution", "256", "--scale", "2", "--overwrite", "-o", str(inputs / "again")]
+    assert main(["resample", concepts[0], *large]) == 0
+    (material,) = json.loads((inputs / "again/palette.json").read_text())["materials"]
+    assert material["metres_per_tile"] == pytest.approx(128 / 96)
+    assert cv2.imread(str(inputs / "again/a/a_basecolor.png")).shape == (256, 256, 3)
+
+
+@pytest.mark.parametrize("damage", ["missing", "not json", "no periods", "other shape", "cut short", "no size"])
+def test_a_damaged_concept_is_named(inputs, capsys, damage):
+    assert extract(inputs, "--keep-concepts") == 0
+    path = inputs / "out/a/a_concept.json"
+    if damage == "missing":
+        path.unlink()
+    elif damage == "not json":
+        path.write_text("{")
+    elif damage == "no periods":
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"periods": None}))
+    elif damage == "no size":
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"metres_per_texel": 0}))
+    elif damage == "cut short":
+        tensors = path.with_suffix(".safetensors")
+        tensors.write_bytes(tensors.read_bytes()[:-9])
+    else:
+        write_tensors(path.with_suffix(".safetensors"), {"pixels": np.zeros((9, 9, 3)), "mask": np.ones((8, 9), bool)})
+    assert main(["resample", str(path), "-o", str(inputs / "again")]) == 2
+    assert "a_concept" in capsys.readouterr().err
+    assert not (inputs / "again").exists()
+
+
+def test_resampling_does_not_replace_the_folder_of_its_concept(inputs, capsys):
+    assert extract(inputs, "--keep-concepts") == 0
+    path = inputs / "out/a/a_concept.json"
+    assert main(["resample", str(path), "--overwrite", "-o", str(inputs / "out")]) == 2
+    assert "name another folder" in capsys.readouterr().err
+    assert path.exists() and (inputs / "out/b/b_basecolor.png").exists()
+
+
+def test_concepts_of_diffusion_have_a_folder_of_their_own(inputs, capsys):
+    assert extract(inputs, "--keep-concepts", "--engine", "diffusion", "--model", "nowhere") == 2
+    assert "--concepts DIR" in capsys.readouterr().err
+    assert not (inputs / "out").exists()
+
+
+def test_a_texture_too_small_or_large_for_its_scale_is_refused(inputs, capsys):
+    assert extract(inputs, "--resolution", "8192", "--scale", "0.5") == 2
+    assert "16384 px" in capsys.readouterr().err

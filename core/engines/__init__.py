@@ -2,7 +2,8 @@
 
 An engine, opened with its own settings, has `learn(pixels, mask, progress) -> concept`,
 `sample(concept, size, seed, progress, quality) -> texture`, as `patch` documents them, and LEARNING_SHARE, learning's
-part of the time of both. A concept and a texture may have warnings.
+part of the time of both. A concept and a texture may have warnings. `to_tensors(concept)` and
+`from_tensors(tensors, facts, progress)`, where it has them, save one.
 """
 
 from . import diffusion, patch

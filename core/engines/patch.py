@@ -110,7 +110,25 @@ def learn(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> Concept:
     pixels (h, w, 3) float32, perceptually encoded, 0 to 1; mask (h, w) bool, the region.
     Raises PaletteError when too few patches of PATCH x PATCH px lie in the region.
     """
+    # as a saved concept holds them, so that it gives the same texture
+    pixels = pixels.astype(np.float16).astype(np.float32)
     return Concept(pixels, mask, find_periods(pixels, mask), _levels(pixels, mask, progress))
+
+
+def to_tensors(concept: Concept) -> tuple[dict[str, np.ndarray], dict]:
+    """What `from_tensors` needs to give the same concept again: arrays, and facts that JSON can hold."""
+    return {"pixels": concept.pixels.astype(np.float16), "mask": concept.mask}, {"periods": list(concept.periods)}
+
+
+def from_tensors(tensors: dict[str, np.ndarray], facts: dict, progress: Progress) -> Concept:
+    """The concept. Raises KeyError, TypeError or ValueError when something is missing or of another kind."""
+    pixels, mask = tensors["pixels"].astype(np.float32), tensors["mask"].astype(bool)
+    down, right = (None if period is None else float(period) for period in facts["periods"])
+    if pixels.shape != (*mask.shape, 3):
+        raise ValueError(f"pixels are {pixels.shape} and the mask {mask.shape}")
+    if not np.isfinite(pixels[mask]).all() or not all(period is None or period >= 1 for period in (down, right)):
+        raise ValueError("its numbers are out of range")
+    return Concept(pixels, mask, (down, right), _levels(pixels, mask, progress))
 
 
 def _levels(pixels: np.ndarray, mask: np.ndarray, progress: Progress) -> list[Level]:
