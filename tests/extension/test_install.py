@@ -145,6 +145,20 @@ def test_without_torch_and_opencv_it_enables_and_says_what_is_missing(extension_
     assert "Traceback" not in said and "torch is missing" in said
 
 
+def test_manifest_names_the_licences_of_what_ships(extension_zip):
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    assert {"SPDX:BSD-2-Clause", "SPDX:Apache-2.0", "SPDX:MIT"} < set(manifest["license"])
+    assert len(manifest["copyright"]) == len(manifest["license"])
+    with zipfile.ZipFile(extension_zip) as archive:
+        for file in (
+            "LICENSE",
+            "models/stlpips_alex.md",
+            "models/LICENSE-Apache-2.0.txt",
+            "core/engines/diffusion/clip/LICENSE",
+        ):
+            assert len(archive.read(file)) > 1000, file
+
+
 def test_manifest_gives_a_reason_for_each_permission():
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
     assert manifest["id"] == "material_palette" and "SPDX:GPL-3.0-or-later" in manifest["license"]
