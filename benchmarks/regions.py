@@ -81,8 +81,9 @@ def slic_kmeans(pixels: np.ndarray, count: int) -> np.ndarray:
     return _large(owner.ravel()[labels])
 
 
-def felzenszwalb(pixels: np.ndarray, count: int, k: float = 3000.0) -> np.ndarray:
-    """(H, W) labels: graph segmentation (Felzenszwalb and Huttenlocher 2004); `k` was tuned on training collages."""
+def felzenszwalb(pixels: np.ndarray, count: int, k: float = 1000.0) -> np.ndarray:
+    """(H, W) labels: graph segmentation (Felzenszwalb and Huttenlocher 2004); `k`: of 100 to 6000, best on six
+    training collages (IoU 0.58; 600: 0.56, 2000: 0.42)."""
     encoded = np.round(255 * np.clip(pixels, 0, 1) ** np.float32(1 / 2.2)).astype(np.uint8)
     least = int(LEAST_SHARE * encoded[..., 0].size)
     return cv2.ximgproc.segmentation.createGraphSegmentation(0.8, k, least).processImage(encoded)
@@ -112,7 +113,8 @@ WHOLE = {"SLIC + k-means, true number": slic_kmeans, "Felzenszwalb": felzenszwal
 def flood_fill(pixels: np.ndarray, clicks: list[tuple[int, int, bool]], tolerance: float = 12.0) -> np.ndarray:
     """(H, W) bool: pixels connected to a positive click, of a colour within `tolerance` (CIELAB) of the clicked one's.
 
-    The photo is smoothed by a median of 5 px. `tolerance` was tuned on training collages.
+    The photo is smoothed by a median of 5 px. `tolerance`: of 8, 12, 16, 20 and 26, best over three clicks on
+    six training collages (IoU 0.42; 8: 0.35, 16: 0.36).
     """
     lab = np.dstack([cv2.medianBlur(channel, 5) for channel in cv2.split(lab_of(pixels))])
     masks = {True: np.zeros(lab.shape[:2], bool), False: np.zeros(lab.shape[:2], bool)}
@@ -127,7 +129,8 @@ def flood_fill(pixels: np.ndarray, clicks: list[tuple[int, int, bool]], toleranc
 
 def colour_range(pixels: np.ndarray, clicks: list[tuple[int, int, bool]], tolerance: float = 16.0) -> np.ndarray:
     """(H, W) bool: pixels anywhere whose colour is within `tolerance` of a positive click's and not nearer to a
-    negative one's."""
+    negative one's. `tolerance`: of 8, 12, 16 and 20, over three
+    clicks on six training collages IoU is 0.38, 0.44, 0.44 and 0.43."""
     lab = cv2.GaussianBlur(lab_of(pixels), (0, 0), 2)
     distance = {
         wanted: np.min(
@@ -139,7 +142,7 @@ def colour_range(pixels: np.ndarray, clicks: list[tuple[int, int, bool]], tolera
 
 
 def grabcut_clicks(pixels: np.ndarray, clicks: list[tuple[int, int, bool]], radius: float = 0.12) -> np.ndarray:
-    """(H, W) bool: grabCut seeded by discs around the clicks; `radius` of the photo's width, tuned as the others."""
+    """(H, W) bool: grabCut seeded by discs around the clicks; `radius` of the photo's width, not tuned."""
     small = _small(pixels)
     scale = small.shape[1] / pixels.shape[1]
     mask = np.full(small.shape[:2], cv2.GC_PR_BGD, np.uint8)
