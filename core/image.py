@@ -150,17 +150,11 @@ def read_mask(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
         spec = image.spec()
         orientation = spec.get_int_attribute("Orientation", 1)
         height, width = shape if orientation < 5 else shape[::-1]
-        if abs(spec.width * height / (spec.height * width) - 1) > ASPECT_TOLERANCE:
-            own = (spec.width, spec.height) if orientation < 5 else (spec.height, spec.width)
-            raise PaletteError(
-                f"Mask '{path}' is {own[0]} x {own[1]} px, of another shape than the photo "
-                f"({shape[1]} x {shape[0]} px). Paint it on the photo itself."
-            )
+        _check_aspect(path, spec, shape, orientation)
         alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
         colour = [c for c in range(spec.nchannels) if c not in (alpha, spec.z_channel)] or [alpha]
         least = LOSSY_ZERO.get(image.format_name(), 0)
-        rows = ((np.arange(height) + 0.5) * spec.height / height).astype(int)
-        columns = ((np.arange(width) + 0.5) * spec.width / width).astype(int)
+        rows, columns = _nearest(spec.height, height), _nearest(spec.width, width)
         painted = np.zeros((height, width), bool)
         visible = np.ones((height, width), bool)
         for row, block in _blocks(image, path, "Mask"):
@@ -186,13 +180,8 @@ def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
         height, width = shape
         if image.format_name() in LOSSY_ZERO or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             raise PaletteError(f"Mask '{path}' doesn't keep colours exactly. Save it as PNG of 8 or 16 bits.")
-        if abs(spec.width * height / (spec.height * width) - 1) > ASPECT_TOLERANCE:
-            raise PaletteError(
-                f"Mask '{path}' is {spec.width} x {spec.height} px, of another shape than the photo "
-                f"({width} x {height} px). Paint it on the photo itself."
-            )
-        rows = ((np.arange(height) + 0.5) * spec.height / height).astype(int)
-        columns = ((np.arange(width) + 0.5) * spec.width / width).astype(int)
+        _check_aspect(path, spec, shape)
+        rows, columns = _nearest(spec.height, height), _nearest(spec.width, width)
         alpha = spec.alpha_channel
         colour = [c for c in range(spec.nchannels) if c != alpha]
         blocks = [block for _, block in _blocks(image, path, "Mask")]
@@ -200,6 +189,22 @@ def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
     if alpha >= 0:
         codes[codes[..., alpha] == 0] = 0
     return codes[..., colour]
+
+
+def _check_aspect(path: Path, spec: "oiio.ImageSpec", shape: tuple[int, int], orientation: int = 1) -> None:
+    """Raise PaletteError for a mask that, turned upright, is not of a photo's shape (H, W)."""
+    height, width = shape if orientation < 5 else shape[::-1]
+    if abs(spec.width * height / (spec.height * width) - 1) > ASPECT_TOLERANCE:
+        own = (spec.width, spec.height) if orientation < 5 else (spec.height, spec.width)
+        raise PaletteError(
+            f"Mask '{path}' is {own[0]} x {own[1]} px, of another shape than the photo "
+            f"({shape[1]} x {shape[0]} px). Paint it on the photo itself."
+        )
+
+
+def _nearest(stored: int, wanted: int) -> np.ndarray:
+    """(wanted,) indices of the stored lines nearest to the wanted ones."""
+    return ((np.arange(wanted) + 0.5) * stored / wanted).astype(int)
 
 
 def write_image(path: str | Path, pixels: np.ndarray, bits: int = 8) -> None:
