@@ -7,7 +7,7 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from .regions import NeedsPhoto, add_region, image_editor, read_mask_image, set_mask, show_photo
-from .setup import missing_sentence
+from .setup import NeedsPackages
 
 _NEAR = 10  # px; a click that near to a polygon's first corner closes it
 
@@ -29,7 +29,7 @@ def apply_outline(settings, points, take_away=False):
     set_mask(region, mask & ~inside if take_away else mask | inside)
 
 
-class OverPhoto(NeedsPhoto):
+class OverPhoto(NeedsPackages, NeedsPhoto):
     """Mixin of a modal operator that is used with the mouse over the photo in the Image Editor.
 
     A subclass gives `handle(context, event)`, which returns a modal result, or None to let Blender have the event, and
@@ -39,13 +39,6 @@ class OverPhoto(NeedsPhoto):
     bl_options = {"REGISTER"}
     hint = ""
     _PASSED = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "TRACKPADPAN", "TRACKPADZOOM", "TIMER", "HOME"}
-
-    @classmethod
-    def poll(cls, context):
-        if missing_sentence():
-            cls.poll_message_set(missing_sentence())
-            return False
-        return super().poll(context)
 
     def execute(self, context):
         self.report({"ERROR"}, f"{self.bl_label} needs a window and a mouse")

@@ -6,20 +6,13 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from .regions import NeedsRegion, add_region, read_mask_image, remove_region, set_mask
-from .setup import missing_sentence
+from .setup import NeedsPackages
 
 
-class _Edits(NeedsRegion):
+class _Edits(NeedsPackages, NeedsRegion):
     """Mixin: `edit(mask)` gives the active region's new mask."""
 
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        if missing_sentence():
-            cls.poll_message_set(missing_sentence())
-            return False
-        return super().poll(context)
 
     def execute(self, context):
         settings = context.scene.material_palette

@@ -21,6 +21,17 @@ def missing_sentence():
     return f"Missing in this Blender: {names}. The Palette tab says how to get it"
 
 
+class NeedsPackages:
+    """Mixin, before another one with a `poll`: the packages have to be there."""
+
+    @classmethod
+    def poll(cls, context):
+        if missing_sentence():
+            cls.poll_message_set(missing_sentence())
+            return False
+        return super().poll(context)
+
+
 class MATERIAL_PALETTE_OT_copy_install_command(Operator):
     """Copy the command that installs the missing packages into Blender's Python, to be run in a terminal"""
 
