@@ -169,7 +169,8 @@ def read_mask(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read an image of codes, a colour or index per region, as (H, W, C) uint8 or uint16, resized to the nearest pixel.
+    """Read an image of codes, a colour or index per region, as (H, W, C) uint8 or uint16, upright, resized to the
+    nearest pixel.
 
     What is transparent becomes 0. Raises PaletteError for a file that doesn't read as an image, is stored with loss or
     as floats, or whose aspect ratio is more than 2 % off.
@@ -177,10 +178,11 @@ def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
     path = Path(path)
     with _opened(path, "Mask") as image:
         spec = image.spec()
-        height, width = shape
+        orientation = spec.get_int_attribute("Orientation", 1)
+        height, width = shape if orientation < 5 else shape[::-1]
         if image.format_name() in LOSSY_ZERO or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             raise PaletteError(f"Mask '{path}' doesn't keep colours exactly. Save it as PNG of 8 or 16 bits.")
-        _check_aspect(path, spec, shape)
+        _check_aspect(path, spec, shape, orientation)
         rows, columns = _nearest(spec.height, height), _nearest(spec.width, width)
         alpha = spec.alpha_channel
         colour = [c for c in range(spec.nchannels) if c != alpha]
@@ -188,10 +190,10 @@ def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
         codes = np.concatenate(blocks)[rows][:, columns]
     if alpha >= 0:
         codes[codes[..., alpha] == 0] = 0
-    return codes[..., colour]
+    return _upright(codes[..., colour], orientation)
 
 
-def _check_aspect(path: Path, spec: "oiio.ImageSpec", shape: tuple[int, int], orientation: int = 1) -> None:
+def _check_aspect(path: Path, spec: "oiio.ImageSpec", shape: tuple[int, int], orientation: int) -> None:
     """Raise PaletteError for a mask that, turned upright, is not of a photo's shape (H, W)."""
     height, width = shape if orientation < 5 else shape[::-1]
     if abs(spec.width * height / (spec.height * width) - 1) > ASPECT_TOLERANCE:

@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 import pytest
 from material_palette.core import image
 from material_palette.core.errors import PaletteError
-from material_palette.core.image import linear_from_srgb, read_mask, read_photo, srgb_from_linear, write_image
+from material_palette.core.image import linear_from_srgb, read_codes, read_mask, read_photo, srgb_from_linear, write_image
 
 FORMATS = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
 # 32 x 32 px of C 0, M 255, Y 255, K 0 as Adobe writes them: pure red
@@ -366,6 +366,9 @@ def test_mask_with_orientation_fits_the_upright_photo(tmp_path):
     mask = disc()
     store(tmp_path / "a.png", mask * np.uint8(255), Orientation=6)
     assert (read_mask(tmp_path / "a.png", (60, 48)) == np.rot90(mask, -1)).all()
+    assert (read_codes(tmp_path / "a.png", (60, 48))[..., 0] == 255 * np.rot90(mask, -1)).all()
+    with pytest.raises(PaletteError, match="another shape"):
+        read_codes(tmp_path / "a.png", (48, 60))
 
 
 def test_mask_of_another_shape_is_refused(tmp_path):
