@@ -61,8 +61,12 @@ def _parser() -> argparse.ArgumentParser:
         help="one mask image per material, named as the material; for several photos DIR/<photo's name>/. "
         "Or one image of colours or indices, or COCO's JSON",
     )
-    where.add_argument("--segment", metavar="ENGINE", help="find the regions: auto, or sam with --weights")
-    extract.add_argument("--weights", type=Path, metavar="DIR", help="folder of Segment Anything's weights")
+    where.add_argument(
+        "--segment", metavar="ENGINE", help="find the regions: auto; sam or materialistic with --weights"
+    )
+    extract.add_argument(
+        "--weights", type=Path, metavar="PATH", help="weights of sam (a folder) or materialistic (a file)"
+    )
     extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
     extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
     extract.add_argument("--keep-concepts", action="store_true", help="keep what was learnt, for `resample`")

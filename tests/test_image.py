@@ -14,7 +14,14 @@ import OpenImageIO as oiio
 import pytest
 from material_palette.core import image
 from material_palette.core.errors import PaletteError
-from material_palette.core.image import linear_from_srgb, read_codes, read_mask, read_photo, srgb_from_linear, write_image
+from material_palette.core.image import (
+    linear_from_srgb,
+    read_codes,
+    read_mask,
+    read_photo,
+    srgb_from_linear,
+    write_image,
+)
 
 FORMATS = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
 # 32 x 32 px of C 0, M 255, Y 255, K 0 as Adobe writes them: pure red

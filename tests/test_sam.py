@@ -72,7 +72,7 @@ def loaded(request, tmp_path_factory, photo):
 
 def test_the_weights_of_the_folder_are_used(loaded):
     _, _, model, found = loaded
-    ours = found.model.state_dict()
+    ours = found.model.network.state_dict()
     assert all((tensor == ours[name]).all() for name, tensor in model.state_dict().items())
 
 
@@ -86,7 +86,7 @@ def test_a_click_gives_the_models_best_mask(loaded, photo):
     point = (60 * 64 / 80, 12 * 64 / 80) if kind == "sam" else (60 * 64 / 80, 12 * 64 / 40)
     with torch.inference_mode():
         out = model(
-            image_embeddings=found.embedding,
+            image_embeddings=found.model.embedding,
             input_points=torch.tensor([[[point]]]),
             input_labels=torch.tensor([[[1]]]),
             multimask_output=True,
@@ -98,14 +98,131 @@ def test_a_click_gives_the_models_best_mask(loaded, photo):
 def test_boxes_and_negative_clicks_reach_the_model(loaded):
     found = loaded[3]
     prompts = []
-    whole = found._masks
-    found._masks = lambda **given: prompts.append(given) or whole(**given)
+    whole = found.model.network.forward
+    found.model.network.forward = lambda **given: prompts.append(given) or whole(**given)
     found.select([Click(10, 10), Click(70, 30, positive=False)], box=(5, 5, 75, 35))
-    del found._masks
+    del found.model.network.forward
     assert prompts[0]["input_labels"].tolist() == [[[1, 0]]]
     left, top, right, bottom = prompts[0]["input_boxes"][0, 0].tolist()
     assert 0 < left < right <= 64 and 0 < top < bottom <= 64
     assert not found.select([]).any()
+
+
+@pytest.fixture(scope="module", params=["sam", "raw", "sam2"])
+def exported(request, tmp_path_factory):
+    """A folder with an encoder and a decoder in the form of the exports: the mask is a disc around the first point, and
+    brighter where the encoder saw red."""
+    pytest.importorskip("onnxruntime", reason="optional: Segment Anything by ONNX Runtime")
+    onnx = pytest.importorskip("onnx", reason="builds the models of this test")
+    from onnx import TensorProto, helper, numpy_helper
+
+    kind = request.param
+    number = TensorProto.FLOAT
+    folder = tmp_path_factory.mktemp("onnx")
+
+    def save(name, nodes, inputs, outputs, constants=()):
+        weights = [numpy_helper.from_array(np.asarray(value), key) for key, value in constants]
+        told = [
+            [helper.make_tensor_value_info(key, number, shape) for key, shape in side] for side in (inputs, outputs)
+        ]
+        model = helper.make_model(
+            helper.make_graph([helper.make_node(*n[:3], **n[3]) for n in nodes], name, *told, weights),
+            opset_imports=[helper.make_opsetid("", 13)],
+            ir_version=8,
+        )
+        onnx.save(model, str(folder / f"tiny_{name}.onnx"))
+
+    flat = [("Transpose", ["image"], ["planes"], {"perm": [2, 0, 1]}), ("Unsqueeze", ["planes", "axis"], ["batch"], {})]
+    flat = flat if kind == "raw" else [("Identity", ["image"], ["batch"], {})]
+    pool = ("AveragePool", ["batch"], ["image_embeddings"], {"kernel_shape": [4, 4], "strides": [4, 4]})
+    more = [("Identity", ["image_embeddings"], ["high_res_feats_0"], {})] if kind == "sam2" else []
+    embeddings = ["image_embeddings", "high_res_feats_0"][: 1 + len(more)]
+    save(
+        "encoder",
+        [*flat, pool, *more],
+        [("image", [64, 64, 3] if kind == "raw" else [1, 3, 64, 64])],
+        [(name, [1, 3, 16, 16]) for name in embeddings],
+        [("axis", np.array([0]))],
+    )
+    rows, columns = np.mgrid[:16, :16].astype(np.float32)
+    centres = np.stack([columns.ravel() * 4 + 2, rows.ravel() * 4 + 2], 1)[None]
+    save(
+        "decoder",
+        [
+            ("Slice", ["point_coords", "zero", "one"], ["first"], {}),
+            ("Sub", ["centres", "first"], ["difference"], {}),
+            ("Mul", ["difference", "difference"], ["squares"], {}),
+            ("ReduceSum", ["squares", "two"], ["distance"], {"keepdims": 0}),
+            ("Sub", ["radius", "distance"], ["disc"], {}),
+            ("Reshape", ["disc", "shape"], ["image_disc"], {}),
+            ("Concat", ["image_disc"] * (3 if kind == "sam2" else 4), ["masks"], {"axis": 1}),
+            ("Identity", ["scores"], ["iou_predictions"], {}),
+            ("Identity", ["point_labels"], ["unused"], {}),
+        ],
+        [
+            *((name, [1, 3, 16, 16]) for name in embeddings),
+            ("point_coords", [1, None, 2]),
+            ("point_labels", [1, None]),
+            *([] if kind == "sam2" else [("mask_input", [1, 1, 16, 16]), ("has_mask_input", [1])]),
+        ],
+        [("masks", None), ("iou_predictions", None), ("unused", None)],
+        [
+            ("zero", np.array([0, 0, 0])),
+            ("one", np.array([1, 1, 2])),
+            ("two", np.array([2])),
+            ("radius", np.float32([150.0])),
+            ("centres", centres),
+            ("shape", np.array([1, 1, 16, 16])),
+            ("scores", np.full((1, 3 if kind == "sam2" else 4), 0.9, np.float32)),
+        ],
+    )
+    return kind, folder
+
+
+def test_onnx_models_get_the_photo_and_the_click_where_they_are(exported, photo):
+    kind, folder = exported
+    found = sam.Sam(folder)
+    seen = []
+    run = found.model.encoder.run
+    found.model.encoder = type("Spy", (), {"run": lambda self, names, feed: seen.append(feed) or run(names, feed)})()
+    found.model.encoder.get_outputs = sam.Sam(folder).model.encoder.get_outputs
+    found.look(np.full_like(photo, 0.5) * [1, 0, 0])
+    red = seen[0]["image"] if kind == "raw" else seen[0]["image"][0].transpose(1, 2, 0)
+    inside = red[:32, :, 0] if kind != "sam2" else red[..., 0]  # a photo of 80 x 40 fills half of the square
+    level = 0.735  # 0.5 in sRGB
+    assert np.allclose(inside, 255 * level if kind == "raw" else (level - 0.485) / 0.229, rtol=0.01)
+    assert kind == "sam2" or not red[32:].any()
+    mask = found.select([Click(60, 12)])
+    rows, columns = np.nonzero(mask)
+    assert abs(columns.mean() - 60) < 2 and abs(rows.mean() - 12) < 2
+    assert mask.shape == photo.shape[:2] and 0 < mask.mean() < 0.5
+
+
+def test_onnx_prompts_are_those_of_the_export(exported, photo):
+    found = sam.Sam(exported[1])
+    found.look(photo)
+    seen = []
+    run = found.model.decoder.run
+    found.model.decoder = type("Spy", (), {"run": lambda self, names, feed: seen.append(feed) or run(names, feed)})()
+    found.select([Click(10, 10), Click(70, 30, positive=False)], box=(0, 0, 80, 40))
+    found.select([Click(10, 10)])
+    assert seen[0]["point_labels"].tolist() == [[1, 0, 2, 3]]
+    lower = 64 if exported[0] == "sam2" else 32
+    assert seen[0]["point_coords"][0, 2:].tolist() == [[0, 0], [64, lower]]
+    assert seen[1]["point_labels"].tolist() == [[1, -1]]
+
+
+def test_onnx_models_of_another_kind_are_refused(exported, tmp_path):
+    _, folder = exported
+    (tmp_path / "encoder.onnx").write_bytes((folder / "tiny_encoder.onnx").read_bytes())
+    with pytest.raises(PaletteError, match="1 and 0 files"):
+        sam.Sam(tmp_path)
+    (tmp_path / "decoder.onnx").write_bytes((folder / "tiny_encoder.onnx").read_bytes())
+    with pytest.raises(PaletteError, match="takes image and gives image_embeddings"):
+        sam.Sam(tmp_path)
+    (tmp_path / "decoder.onnx").write_bytes(b"nonsense")
+    with pytest.raises(PaletteError, match="can't be loaded"):
+        sam.Sam(tmp_path)
 
 
 def test_everything_is_disjoint(loaded, photo, monkeypatch):

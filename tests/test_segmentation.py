@@ -140,7 +140,7 @@ def test_two_megapixels_take_at_most_four_seconds_and_stop_at_once(scene):
 
 def test_wrong_settings_are_named():
     pixels = np.full((64, 64, 3), 0.5, np.float32)
-    with pytest.raises(PaletteError, match="no segmentation 'knife'; there is: auto, sam"):
+    with pytest.raises(PaletteError, match="no segmentation 'knife'; there is: auto, materialistic, sam"):
         segment(pixels, engine="knife")
     for count in (0, -1, 33):
         with pytest.raises(PaletteError, match=f"number of regions is {count}; it must be from 1 to 32"):

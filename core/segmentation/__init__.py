@@ -8,9 +8,10 @@ import numpy as np
 from ..errors import PaletteError
 from ..region import Region
 from .auto import segment_auto
+from .materialistic import segment_materialistic
 from .sam import segment_sam
 
-SEGMENTERS = {"auto": segment_auto, "sam": segment_sam}
+SEGMENTERS = {"auto": segment_auto, "sam": segment_sam, "materialistic": segment_materialistic}
 MOST_REGIONS = 32
 
 
@@ -26,7 +27,7 @@ def segment(
     """At most `regions` regions of a photo (H, W, 3) linear float32, disjoint, by decreasing area.
 
     They need not cover the photo: what is too small to hold a texture or no surface is left out, and `warn` told.
-    `weights` is the folder of an engine that doesn't bring its own ("sam").
+    `weights` is the folder or file of an engine that doesn't bring its own ("sam", "materialistic").
     Raises PaletteError for an unknown engine, a number of regions outside 1..32, or a photo without any region.
     """
     if engine not in SEGMENTERS:
