@@ -53,7 +53,9 @@ SHORTEST_PERIOD = 3.0  # px; below it a level is too coarse to see the phase
 OCCURRENCE = 3.0  # lambda, in median patch distances
 COHERENCE = 0.6  # a random source must cost less than this share of one that continues a neighbour
 REACHES = (64, 8, 1)  # px of the random jumps
-BAND = 1 << 16  # pixels searched at a time by a thread
+UNKNOWN = -1.0  # a cost that nobody has asked for yet
+BAND = 1 << 16  # pixels at most searched at a time by a thread
+BANDS = 4  # at least, so that small levels keep more than one thread busy
 RANKED = 1 << 16  # patches at most that decide a distribution
 QUANTILES = 1024
 MATCHED = 3  # scales at which the finished texture's patches are matched
@@ -228,8 +230,16 @@ def sample(
                 if i:
                     image = _match(level, image, 1, generator, pool, lambda fraction: report(0.2))
                 jumps = int(torch.randint(2**31, (1,), generator=generator))
+                # jumps find nothing any more where structure is decided already
                 coordinates = _search(
-                    level, image, coordinates, phases[i], jumps, pool, lambda fraction: report(0.2 + 0.8 * fraction)
+                    level,
+                    image,
+                    coordinates,
+                    phases[i],
+                    REACHES if i else (),
+                    jumps,
+                    pool,
+                    lambda fraction: report(0.2 + 0.8 * fraction),
                 )
                 done += share
         return coordinates
@@ -246,7 +256,8 @@ def sample(
                 progress(start + 0.1 * fraction / scales, "matching the texture's patches")
 
             small = image if i == 0 else _resized(image, sizes[i])
-            moved = _match(levels[i], small, preset.matches, generator, pool, finish)
+            # of the exemplar before it was stretched, which blurs
+            moved = _match(concept.levels[i], small, preset.matches, generator, pool, finish)
             image = moved if i == 0 else image.add_(_enlarged(moved.sub_(small), size))
         image.clamp_(0, 1)
     columns = levels[0].shape[1]
@@ -407,7 +418,7 @@ def _each_band(size: tuple[int, int], work: Callable, pool: ThreadPoolExecutor, 
     """work(number, top, end) for bands of rows that cover the texture, on all cores. A band bounds the memory and the
     time to cancel; its result may not depend on another band's, so that the order does not matter."""
     h, w = size
-    rows = max(1, BAND // w)
+    rows = max(1, min(BAND // w, -(-h // BANDS)))
     tops = range(0, h, rows)
     working = [pool.submit(work, number, top, min(h, top + rows)) for number, top in enumerate(tops)]
     try:
@@ -509,8 +520,9 @@ def _moves(before: np.ndarray, after: np.ndarray) -> tuple[torch.Tensor, torch.T
     return *(torch.from_numpy(x[..., None]) for x in (low, step)), torch.from_numpy(moves.astype(np.float32))
 
 
-def _search(level: Level, image, before, phases: _Phases, seed: int, pool: ThreadPoolExecutor, report) -> torch.Tensor:
-    """One round of search: better coordinates (H, W) than `before` for the texture `image` (H, W, 3)."""
+def _search(level: Level, image, before, phases: _Phases, reaches, seed: int, pool, report) -> torch.Tensor:
+    """One round of search: better coordinates (H, W) than `before` for the texture `image` (H, W, 3); reaches in px of
+    the random jumps."""
     h, w = before.shape
     stride = level.shape[1]
     after = torch.empty_like(before)
@@ -540,7 +552,8 @@ def _search(level: Level, image, before, phases: _Phases, seed: int, pool: Threa
                 cost += OUT_OF_PHASE * scale * phases.misfit(source, place // w, place % w)
             return cost
 
-        cost = cost_of(torch.arange(len(current)), current)
+        # most pixels are never asked for what they cost: all their neighbours go on from the same source
+        cost = torch.full((len(current),), UNKNOWN)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 if dy or dx:
@@ -548,7 +561,7 @@ def _search(level: Level, image, before, phases: _Phases, seed: int, pool: Threa
                     wide = torch.cat([above[None], current.reshape(-1, w), below[None]])
                     _improve(level, cost_of, current, cost, _continued(wide, 1, dy, dx, stride))
         generator = torch.Generator().manual_seed(seed + number)
-        for reach in REACHES:
+        for reach in reaches:
             jump = torch.randint(-reach, reach + 1, (2, len(current)), generator=generator)
             _improve(level, cost_of, current, cost, current + jump[0] * stride + jump[1], COHERENCE)
         after[top:end] = current.reshape(-1, w)
@@ -562,6 +575,8 @@ def _improve(level: Level, cost_of: Callable, current: torch.Tensor, cost: torch
     ok = (candidate != current) & (candidate >= 0) & (candidate < len(level.valid))
     where = ok.nonzero()[:, 0]
     where = where[level.valid[candidate[where]]]
+    unknown = where[cost[where] == UNKNOWN]
+    cost[unknown] = cost_of(unknown, current[unknown])
     source = candidate[where]
     found = cost_of(where, source)
     better = found < margin * cost[where]
