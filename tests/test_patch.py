@@ -100,10 +100,16 @@ def test_patches_are_matched_to_the_exemplars_on_the_torus():
 
 
 def test_enlarging_wraps():
+    def enlarged(image, size):
+        large = torch.zeros(*size, 3)
+        with ThreadPoolExecutor(2) as pool:
+            patch._add_enlarged(large, image, pool, lambda fraction: None)
+        return large
+
     image = torch.rand(6, 9, 3)
-    large = patch._enlarged(image, (18, 27))
-    assert torch.allclose(patch._enlarged(image.roll((2, 1), (0, 1)), (18, 27)), large.roll((6, 3), (0, 1)), atol=1e-6)
-    assert patch._enlarged(image, (13, 20)).shape == (13, 20, 3)
+    large = enlarged(image, (18, 27))
+    assert torch.allclose(enlarged(image.roll((2, 1), (0, 1)), (18, 27)), large.roll((6, 3), (0, 1)), atol=1e-6)
+    assert torch.allclose(enlarged(torch.full((6, 9, 3), 0.3), (13, 20)), torch.full((13, 20, 3), 0.3))
 
 
 def test_the_sample_most_alike_is_kept():

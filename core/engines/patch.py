@@ -223,7 +223,7 @@ def sample(
         for i in range(first, last - 1, -1):
             level = levels[i]
             if i < coarsest:
-                coordinates = _upsample(level, levels[i + 1], coordinates, sizes[i])
+                coordinates = _upsample(level, levels[i + 1], coordinates, sizes[i], pool, report)
             share = work[i] / rounds[i]
             for _ in range(rounds[i]):
                 image = _vote(level, coordinates, pool, lambda fraction: report(0.2 * fraction))
@@ -247,24 +247,51 @@ def sample(
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
         samples = [refine(None, coarsest, chosen) for _ in range(preset.samples)]
         coordinates = refine(_most_alike(levels[chosen], samples), chosen - 1, 0)
-        image = levels[0].pixels[coordinates]
-        scales = min(MATCHED, len(levels))
+        image = _gathered(levels[0].pixels, coordinates, pool, lambda fraction: report(0.0))
+        scales = min(MATCHED, len(levels), len(concept.levels))
         for i in reversed(range(scales)):
-            start = 0.9 + 0.1 * (scales - 1 - i) / scales
+            start = 0.9 + 0.09 * (scales - 1 - i) / scales
 
             def finish(fraction: float, start=start) -> None:
-                progress(start + 0.1 * fraction / scales, "matching the texture's patches")
+                progress(start + 0.09 * fraction / scales, "matching the texture's patches")
 
             small = image if i == 0 else _resized(image, sizes[i])
             # of the exemplar before it was stretched, which blurs
             moved = _match(concept.levels[i], small, preset.matches, generator, pool, finish)
-            image = moved if i == 0 else image.add_(_enlarged(moved.sub_(small), size))
-        image.clamp_(0, 1)
-    columns = levels[0].shape[1]
-    coordinates = torch.stack([coordinates // columns / stretch[0], coordinates % columns / stretch[1]], -1).long()
-    coordinates = coordinates.clamp_max(torch.tensor(concept.mask.shape) - 1)
-    shift = _calmest(image)
-    return Texture(image.roll(shift, (0, 1)).numpy(), coordinates.roll(shift, (0, 1)).numpy())
+            if i == 0:
+                image = moved
+            else:
+                _add_enlarged(image, moved.sub_(small), pool, finish)
+        shift = _calmest(image, lambda: finish(1.0))
+        return _finished(image, coordinates, shift, concept.mask.shape, levels[0], stretch, pool, progress)
+
+
+def _gathered(pixels: torch.Tensor, coordinates: torch.Tensor, pool: ThreadPoolExecutor, report) -> torch.Tensor:
+    """The texture (H, W, 3) that the coordinates make of the exemplar's pixels."""
+    image = torch.empty(*coordinates.shape, 3)
+
+    def gather(number: int, top: int, end: int) -> None:
+        image[top:end] = pixels[coordinates[top:end]]
+
+    _each_band(tuple(coordinates.shape), gather, pool, report)
+    return image
+
+
+def _finished(image, coordinates, shift, shape, level: Level, stretch, pool: ThreadPoolExecutor, progress) -> Texture:
+    """The texture rolled by shift, and the coordinates in the exemplar of that shape as it was before stretching."""
+    h, w = coordinates.shape
+    pixels, places = np.empty((h, w, 3), np.float32), np.empty((h, w, 2), np.int64)
+
+    def finish(number: int, top: int, end: int) -> None:
+        rows = (np.arange(top, end) + shift[0]) % h
+        pixels[rows] = np.roll(image[top:end].clamp(0, 1).numpy(), shift[1], 1)
+        source = coordinates[top:end].numpy()
+        for axis, index in enumerate((source // level.shape[1], source % level.shape[1])):
+            index = np.minimum((index / stretch[axis]).astype(np.int64), shape[axis] - 1)
+            places[rows, :, axis] = np.roll(index, shift[1], 1)
+
+    _each_band((h, w), finish, pool, lambda fraction: progress(0.99 + 0.01 * fraction, "finishing the texture"))
+    return Texture(pixels, places)
 
 
 def _most_alike(level: Level, samples: list[torch.Tensor]) -> torch.Tensor:
@@ -279,25 +306,38 @@ def _most_alike(level: Level, samples: list[torch.Tensor]) -> torch.Tensor:
 
 def _resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """The means of the image (H, W, 3) over a coarser grid."""
-    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+    return torch.from_numpy(cv2.resize(image.numpy(), size[::-1], interpolation=cv2.INTER_AREA))
 
 
-def _enlarged(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Bilinear on the torus."""
-    for axis in (0, 1):
-        n = image.shape[axis]
-        at = (torch.arange(size[axis]) + 0.5) * (n / size[axis]) - 0.5
+def _add_enlarged(image: torch.Tensor, small: torch.Tensor, pool: ThreadPoolExecutor, report) -> None:
+    """Adds to the image (H, W, 3), in place, a smaller one, enlarged bilinearly on the torus."""
+    h, w = image.shape[:2]
+
+    def neighbours(first: int, last: int, size: int, count: int):
+        at = (torch.arange(first, last) + 0.5) * (count / size) - 0.5
         below = at.floor().long()
-        part = (at - below)[:, None, None] if axis == 0 else (at - below)[:, None]
-        image = torch.lerp(image.index_select(axis, below % n), image.index_select(axis, (below + 1) % n), part)
-    return image
+        return below % count, (below + 1) % count, at - below
+
+    left, right, across = neighbours(0, w, w, small.shape[1])
+
+    def add(number: int, top: int, end: int) -> None:
+        above, below, down = neighbours(top, end, h, small.shape[0])
+        rows = torch.lerp(small[above], small[below], down[:, None, None])
+        image[top:end] += torch.lerp(rows[:, left], rows[:, right], across[:, None])
+
+    _each_band((h, w), add, pool, lambda fraction: report(1.0))
 
 
-def _calmest(image: torch.Tensor) -> tuple[int, int]:
+def _calmest(image: torch.Tensor, report: Callable[[], None]) -> tuple[int, int]:
     """The roll that puts the border where the texture changes least: a torus may be cut anywhere."""
-    rows = (image - image.roll(1, 0)).abs().mean((1, 2))
-    columns = (image - image.roll(1, 1)).abs().mean((0, 2))
-    return -int(rows.argmin()), -int(columns.argmin())
+    step = max(1, BAND // image.shape[1])
+    rows, columns = [], torch.zeros(image.shape[1])
+    for top in range(0, len(image), step):
+        report()
+        wide = _with_halo(image, top, min(len(image), top + step), 1)[:-1]
+        rows.append((wide[1:] - wide[:-1]).abs_().mean((1, 2)))
+        columns += (wide[1:] - wide[1:].roll(1, 1)).abs_().sum((0, 2))
+    return -int(torch.cat(rows).argmin()), -int(columns.argmin())
 
 
 def _whole_periods(periods, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[int, int]]:
@@ -399,12 +439,21 @@ def _block(level: Level, limit: int) -> tuple[int, torch.Tensor]:
         side = max(PATCH, int(side * 0.85))
 
 
-def _upsample(level: Level, coarse: Level, coordinates: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    rows, columns = torch.arange(size[0])[:, None], torch.arange(size[1])
-    parent = coordinates[rows // 2, columns // 2]
-    y = parent // coarse.shape[1] * 2 + rows % 2
-    x = parent % coarse.shape[1] * 2 + columns % 2
-    return _to_sources(level, y * level.shape[1] + x)
+def _upsample(
+    level: Level, coarse: Level, coordinates: torch.Tensor, size: tuple[int, int], pool: ThreadPoolExecutor, report
+) -> torch.Tensor:
+    fine = torch.empty(size, dtype=torch.long)
+    columns = torch.arange(size[1])
+
+    def upsample(number: int, top: int, end: int) -> None:
+        rows = torch.arange(top, end)[:, None]
+        parent = coordinates[rows // 2, columns // 2]
+        y = parent // coarse.shape[1] * 2 + rows % 2
+        x = parent % coarse.shape[1] * 2 + columns % 2
+        fine[top:end] = _to_sources(level, y * level.shape[1] + x)
+
+    _each_band(size, upsample, pool, lambda fraction: report(0.0))
+    return fine
 
 
 def _to_sources(level: Level, coordinates: torch.Tensor) -> torch.Tensor:
