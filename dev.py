@@ -4,12 +4,13 @@
     python3 dev.py demo    [arguments of extract]       a palette of the bundled photo, into demo/
     python3 dev.py extract PHOTO... -o DIR [...]        the extension's command line, without Blender
     python3 dev.py test    [--quick] [arguments of pytest]
+    python3 dev.py bench   [SUITE ...] [--data DIR] [--quick] [-o DIR]    seconds against accuracy, stability
     python3 dev.py package [--wheels | --wheels all]    the extension's zip, into dist/
 
 The first call makes an environment in .venv/ (Blender as a module, torch, OpenCV: requirements.txt); later ones
 reuse it until requirements.txt or the Python changes. `test` and `--engine diffusion` add what
-requirements-diffusion.txt lists. pip's own settings (PIP_INDEX_URL, PIP_EXTRA_INDEX_URL,
-PIP_FIND_LINKS) are respected.
+requirements-diffusion.txt lists, `bench` what requirements-benchmarks.txt does. pip's own settings (PIP_INDEX_URL,
+PIP_EXTRA_INDEX_URL, PIP_FIND_LINKS) are respected.
 """
 
 # Compiles on every Python 3 from 3.6 on, so that a wrong one is told by name and not by a syntax error.
@@ -174,9 +175,9 @@ def ensure_environment():
         print("Environment ready, {:.0f} s".format(time.time() - start), flush=True)
 
 
-def ensure_diffusion():
-    """Add the packages of the engine `diffusion` to .venv, once."""
-    wanted, done = os.path.join(ROOT, "requirements-diffusion.txt"), os.path.join(VENV, "diffusion.txt")
+def ensure_added(name):
+    """Add the packages of requirements-<name>.txt to .venv, once; what it calls `no-deps` without what they ask for."""
+    wanted, done = os.path.join(ROOT, "requirements-{}.txt".format(name)), os.path.join(VENV, name + ".txt")
     with open(wanted, encoding="utf-8") as file:
         text = file.read()
     with locked():
@@ -184,8 +185,11 @@ def ensure_diffusion():
             with open(done, encoding="utf-8") as file:
                 if file.read() == text:
                     return
-        print("Adding the packages of requirements-diffusion.txt (once)", flush=True)
+        print("Adding the packages of {} (once)".format(os.path.basename(wanted)), flush=True)
         code, lines = pip(["install", "--progress-bar", "off", "-r", wanted, "-c", REQUIREMENTS])
+        alone = re.findall(r"pip install --no-deps (\S+==[\w.]+)", text)
+        if not code and alone:
+            code, lines = pip(["install", "--progress-bar", "off", "--no-deps", *alone])
         if code:
             raise SetupError(pip_failure(lines))
         with open(done, "w", encoding="utf-8") as file:
@@ -385,6 +389,50 @@ def test(arguments):
     return int(pytest.main(arguments))
 
 
+SUITES = ("texture", "exemplar", "svbrdf", "segmentation", "needs", "endtoend", "stability", "speed")
+WITH_DATA = ("exemplar", "svbrdf", "segmentation")  # have no data of their own
+
+
+def bench(arguments):
+    """Run the suites one after the other, each in a process of its own and a folder of its own."""
+    parser = argparse.ArgumentParser(prog="dev.py bench", description="Further arguments are those of the suites.")
+    parser.add_argument("suites", nargs="*", metavar="SUITE", help=", ".join(SUITES) + " (all)")
+    parser.add_argument("--data", help="the folder that benchmarks/README.md describes; without: procedural materials")
+    parser.add_argument("--quick", action="store_true", help="little of each, to see that it works: under 5 minutes")
+    parser.add_argument("-o", "--output", default=os.path.join(ROOT, "dist", "benchmarks"), help="(dist/benchmarks)")
+    options, rest = parser.parse_known_args(arguments)
+    unknown = [suite for suite in options.suites if suite not in SUITES]
+    if unknown:
+        parser.error("there is no suite '{}'; choose from: {}".format(unknown[0], ", ".join(SUITES)))
+    if not options.data and not options.quick:
+        parser.error("give --data DIR, or --quick")
+    failed = []
+    for suite in options.suites or [s for s in SUITES if os.path.exists(script_of(s))]:
+        command = [sys.executable, script_of(suite), "-o", os.path.join(options.output, suite), *rest]
+        if options.data or suite in WITH_DATA:
+            command += ["--data", options.data or made_data()]
+        start = time.time()
+        print("\n==== {}".format(suite), flush=True)
+        if options.quick:
+            command.append("--quick")
+        # one thread: torch's own wait on each other when a core is busy
+        code = subprocess.call(command, env=dict(os.environ, OMP_NUM_THREADS="1"))
+        print("==== {}: {:.0f} s{}".format(suite, time.time() - start, ", FAILED" if code else ""), flush=True)
+        failed += [suite] if code else []
+    return 1 if failed else 0
+
+
+def script_of(suite):
+    return os.path.join(ROOT, "benchmarks", suite + ".py")
+
+
+def made_data():
+    load_package()
+    folder = os.path.join(ROOT, "dist", "benchmarks", "data")
+    importlib.import_module("material_palette.benchmarks.made").make_data(folder)
+    return folder
+
+
 def package(arguments):
     parser = argparse.ArgumentParser(prog="dev.py package")
     parser.add_argument(
@@ -475,7 +523,7 @@ def add_wheels(staging, which):
         file.write(text if found else text + "\n" + declared)
 
 
-COMMANDS = {"demo": demo, "extract": extract, "test": test, "package": package}
+COMMANDS = {"demo": demo, "extract": extract, "test": test, "bench": bench, "package": package}
 
 
 # ---------------------------------------------------------------- from the outside in
@@ -510,7 +558,9 @@ def main(argv):
             return hand_over([*python, os.path.abspath(__file__), *argv])
         ensure_environment()
         if argv[0] == "test" or "diffusion" in argv:
-            ensure_diffusion()
+            ensure_added("diffusion")
+        if argv[0] == "bench":
+            ensure_added("benchmarks")
         return hand_over([venv_python(VENV), os.path.abspath(__file__), *argv])
     except SetupError as error:
         print("dev.py: {}".format(error), file=sys.stderr)

@@ -30,7 +30,7 @@ import dev  # noqa: E402
 
 dev.load_package()
 from material_palette.benchmarks import lighting, measures  # noqa: E402
-from material_palette.benchmarks.texture import commit, machine  # noqa: E402
+from material_palette.benchmarks.records import commit, machine  # noqa: E402
 from material_palette.core import rectification  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Regions against true masks: `auto` and `pick` beside their opponents, on the same photos in one run.
 
-    python benchmarks/segmentation.py DATA -o benchmarks/results/segmentation/     about 20 minutes on one core
-    python benchmarks/segmentation.py DATA -o DIR --only auto stability     some of: auto pick stability time sheet
+    python benchmarks/segmentation.py --data DATA -o benchmarks/results/segmentation/     about 20 minutes on one core
+    python benchmarks/segmentation.py --data DATA -o DIR --only auto stability   some of: auto pick stability time sheet
 
 DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages are made of textures of the test split,
 which nothing was fitted on; no scene and none of its materials was either. Writes segmentation.csv, a row per measure,
@@ -166,7 +166,7 @@ def times(table: Table, data: Path) -> None:
     """Of a real photo enlarged to 2 megapixels, each in a process of its own."""
     for part in ("auto", "pick"):
         if ("time", part, "ours") not in table.done:
-            command = [sys.executable, __file__, str(data), "-o", str(table.path.parent), "--measure", part]
+            command = [sys.executable, __file__, "--data", str(data), "-o", str(table.path.parent), "--measure", part]
             wall, cpu, change, megabytes = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
             table.add("time", part, "ours", wall_s=wall, cpu_s=cpu, change_ms=change, peak_mb=megabytes)
 
@@ -217,24 +217,28 @@ def sheet(data: Path, folder: Path, every: bool) -> None:
     (folder / ("every.txt" if every else "sheet.txt")).write_text("\n".join(words) + "\n", encoding="utf-8")
 
 
-def main() -> None:
+def main(given: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
+    parser.add_argument("--data", type=Path, required=True, metavar="DATA")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--collages", type=int, default=COLLAGES)
     parser.add_argument("--every-photo", action="store_true", help="all photos on the sheet, not only those to share")
     parser.add_argument("--measure", choices=("auto", "pick"), help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    parser.add_argument("--quick", action="store_true", help="two collages, whole photos only")
+    arguments = parser.parse_args(given)
     if arguments.measure:
         measure_time(arguments.data, arguments.measure)
-        return
+        return 0
+    if arguments.quick:
+        arguments.collages, arguments.only = 2, ("auto",)
     arguments.output.mkdir(parents=True, exist_ok=True)
     table = Table(arguments.output / "segmentation.csv")
     choices = sources(arguments.data, "test")
-    photos = scenes(arguments.data) + [collage(choices, seed) for seed in range(arguments.collages)]
-    for photo in photos[:8]:
+    rendered = scenes(arguments.data)[: 0 if arguments.quick else None]
+    for photo in rendered:
         photo.name = "scene_" + photo.name
+    photos = rendered + [collage(choices, seed) for seed in range(arguments.collages)]
     for part, run in (("auto", whole_photos), ("stability", stability), ("pick", clicks)):
         if part in arguments.only:
             run(table, photos if part != "stability" else photos[::2])
@@ -245,7 +249,8 @@ def main() -> None:
     text = json.dumps(table.summary(), indent=1)
     (arguments.output / "segmentation.json").write_text(text + "\n", encoding="utf-8")
     print(text)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -458,23 +458,26 @@ def sheet(materials: list[Material], decompose: Decompose, path: Path) -> None:
     cv2.imwrite(str(path), (np.clip(pixels, 0, 1) * 255).round().astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "dist" / "benchmarks")
     parser.add_argument("--rows", nargs="+", default=list(DEFAULT), help="names of ROWS, name=FILE, label:name=FILE")
     parser.add_argument("--against", default="constant prior", help="the row that delta is relative to")
     parser.add_argument("--collections", nargs="+", help="held-out collections that count; default: all")
-    parser.add_argument("--quick", action="store_true", help="polyhaven, 256 px, one seed, no cost")
+    parser.add_argument("--quick", action="store_true", help="polyhaven if there, 256 px, one seed, no cost")
     parser.add_argument("--no-cost", action="store_true", help="without seconds and memory")
     parser.add_argument("--cost", type=int, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     training, held_out = split(options.data)
     if options.cost:
-        return print_cost(options.rows[0], options.cost, held_out)
+        print_cost(options.rows[0], options.cost, held_out)
+        return 0
     size, seeds = (256, SEEDS[:1]) if options.quick else (SIZE, SEEDS)
-    collections = ["polyhaven"] if options.quick else options.collections
+    collections = (
+        ["polyhaven"] if options.quick and (options.data / "pbr" / "polyhaven").is_dir() else options.collections
+    )
     held_out = [f for f in held_out if not collections or f.parent.name in collections]
     options.output.mkdir(parents=True, exist_ok=True)
     start = time.time()
@@ -528,7 +531,8 @@ def main() -> None:
     shown = [f for f in held_out if f.parent.name in ("polyhaven", "ambientcg")][:: max(1, len(held_out) // 6)][:6]
     last = rows[options.rows[-1]]
     sheet([read_material(f, size) for f in shown or held_out[:4]], last, options.output / "svbrdf.jpg")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

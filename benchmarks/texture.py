@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Seconds against accuracy of texture engines, all on the same exemplars in one run.
 
-    python benchmarks/texture.py DATA -o benchmarks/results/      25 minutes on two cores
+    python benchmarks/texture.py --data DATA -o benchmarks/results/      25 minutes on two cores
     python benchmarks/texture.py --quick -o dist/benchmarks/      3 minutes, on the bundled examples only
 
 DATA is a folder with textures/<name>.jpg; the regions of examples/*/masks always take part. Writes texture.csv (a row
@@ -13,9 +13,6 @@ goes on; delete parts/ to measure anew. Needs requirements-benchmarks.txt beside
 import argparse
 import csv
 import json
-import os
-import platform
-import subprocess
 import sys
 import tempfile
 import time
@@ -35,6 +32,7 @@ import dev  # noqa: E402
 
 dev.load_package()
 from material_palette.benchmarks import baselines, measures  # noqa: E402
+from material_palette.benchmarks.records import commit, machine  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402
 from material_palette.core.image import read_mask, read_photo, srgb_from_linear  # noqa: E402
@@ -340,26 +338,6 @@ def markdown(summary: dict) -> str:
     return "\n".join(lines)
 
 
-def machine() -> dict:
-    cpu = platform.processor()
-    try:
-        cpu = next(x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name"))
-        cpu = cpu.split(":")[1].strip()
-    except (OSError, StopIteration):
-        pass
-    versions = {"python": platform.python_version(), "torch": torch.__version__, "opencv": cv2.__version__}
-    return {"cpu": cpu, "cores": os.cpu_count(), "threads": 1, **versions, "numpy": np.__version__}
-
-
-def commit() -> str:
-    """The commit that is measured; a plus says that the engine's files differ from it."""
-
-    def git(*arguments):
-        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-
-    return git("rev-parse", "--short=10", "HEAD") + ("+" if git("status", "--porcelain", "core") else "")
-
-
 def write_chart(summary: dict, folder: Path) -> None:
     import matplotlib
 
@@ -422,7 +400,7 @@ def write_sheet(textures: dict, exemplars: list[Exemplar], engines: list[str], f
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("data", nargs="?", type=Path, metavar="DATA", help="folder with textures/*.jpg")
+    parser.add_argument("--data", type=Path, metavar="DATA", help="folder with textures/*.jpg")
     parser.add_argument("--quick", action="store_true", help="three bundled regions, without the two slowest engines")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=None, metavar="NAME", help=", ".join(ENGINES))
@@ -430,7 +408,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, required=True)
     options = parser.parse_args(arguments)
     if options.data is None and not options.quick:
-        parser.error("give DATA, or --quick")
+        parser.error("give --data DATA, or --quick")
     engines = options.engines or [e for e in ENGINES if not (options.quick and e in ("gpnn-exact", "gatys"))]
     if "gpnn-faiss" in engines and not _installed("faiss"):
         print("faiss is missing (pip install faiss-cpu): GPNN with FAISS is left out", file=sys.stderr)
