@@ -27,6 +27,7 @@ from material_palette.core.engines.diffusion import (  # noqa: E402
     PROMPTS,
     DiffusionSettings,
     Engine,
+    decoding,
     sampling,
     tuning,
 )
@@ -97,7 +98,7 @@ def run(options: argparse.Namespace) -> list[dict]:
                     continue
                 engine.settings = dataclasses.replace(settings, prompt=key[2], candidates=1)
                 texture = engine.sample(concept, (options.resolution,) * 2, key[3], quiet)
-                raw = sampling.decode(model, texture.latents, quiet)
+                raw = decoding.decode(model, texture.latents, quiet)
                 name = "_".join((region.name, inversion, str(WORDINGS.index(key[2])), str(key[3]))).replace(" ", "-")
                 write_image(options.output / f"{name}.png", texture.pixels)
                 row = dict(zip(("region", "inversion", "prompt", "seed"), key, strict=True))

@@ -1,5 +1,6 @@
 """The engine `diffusion` on tiny random models of the real classes: what holds for any weights."""
 
+import contextlib
 import json
 import math
 import shutil
@@ -17,6 +18,7 @@ from material_palette.core.engines import diffusion  # noqa: E402
 from material_palette.core.engines.diffusion import (  # noqa: E402
     DiffusionSettings,
     Engine,
+    decoding,
     memory,
     sampling,
     tuning,
@@ -257,7 +259,7 @@ def test_rolling_takes_the_seams_that_are_there_without(open_engine, k):
     for roll in ("none", "noise", "feature"):
         latents = [sample_latents(model, k, 15, seed, roll=roll) for seed in seeds]
         seams = np.median([window_seams(z, model.window) for z in latents])
-        images = [sampling.decode(model, z, quiet) for z in latents]
+        images = [decoding.decode(model, z, quiet, 8, 1) for z in latents]
         found[roll] = seams, np.median([torus.wrap_ratio(z[0].permute(1, 2, 0).numpy()) for z in latents])
         found[roll] += (np.median([torus.wrap_ratio(image) for image in images]),)
     assert found["none"][0] > 3
@@ -386,31 +388,53 @@ def test_any_size_is_made_and_tiles(open_engine, concept, size):
 # ---------------------------------------------------------------- decoding and colour
 
 
-def test_decoding_in_patches_is_decoding_at_once(open_engine):
+def latents_that_change(side):
+    """Noise whose mean and contrast change across the torus, as a texture's do: no patch is like another."""
+    turn = torch.arange(side) * (2 * math.pi / side)
+    noise = torch.randn(1, 4, side, side, generator=torch.Generator().manual_seed(0))
+    return noise * (1 + 0.7 * turn.sin()[:, None]) + turn.cos()
+
+
+@pytest.mark.parametrize("side, tolerance", [(16, 0.003), (32, 0.1)])
+def test_decoding_in_patches_is_decoding_at_once(open_engine, side, tolerance):
+    """In patches of 8 latents, with statistics of all of the torus or, when it is larger, of a quarter."""
     model = open_engine().model(quiet)
-    z = torch.randn(1, 4, 24, 24, generator=torch.Generator().manual_seed(0))
-    largest = []
-    decode_whole = model.vae.decode
+    z, largest = latents_that_change(side), []
+    hook = model.vae.decoder.conv_in.register_forward_hook(lambda m, x, out: largest.append(out[0, 0].numel()))
+    tiled = decoding.decode(model, z, quiet, 8)
+    assert max(largest) == 24 * 24  # a patch and its margins, however large the texture is
+    hook.remove()
+    whole = decoding.decode(model, z, quiet, side)
+    error = np.abs(tiled - whole).mean(-1) / whole.std()
+    at_borders = np.minimum(np.arange(4 * side) % 32, 31 - np.arange(4 * side) % 32) < 4
+    assert error.mean() < tolerance and error[at_borders].mean() < tolerance
+    # the same at every place of the torus: the decoder is left as it was
+    assert np.array_equal(decoding.decode(model, z, quiet, side), whole)
 
-    def watched(latents, **more):
-        largest.append(latents.shape[2:])
-        return decode_whole(latents, **more)
 
-    model.vae.decode = watched
-    tiled = sampling.decode(model, z, quiet, margin=2)
-    assert len(largest) == 9 and set(largest) == {(12, 12)}
-    # at once: the torus with so much of itself around it that the decoder's own border stays outside
-    wide = torch.nn.functional.pad(z, (8,) * 4, mode="circular") / model.vae.config.scaling_factor
-    with torch.no_grad():
-        whole = decode_whole(wide).sample[0, :, 32:-32, 32:-32].permute(1, 2, 0).add(1).div(2).clamp(0, 1).numpy()
-    inside = np.zeros(96, bool)
-    inside[[i for i in range(96) if 10 <= i % 32 < 22]] = True
-    error = np.abs(tiled - whole)
-    # what is left is the normalisation, whose statistics are the patch's
-    assert error[inside][:, inside].mean() < 0.2 * np.abs(whole - whole.mean((0, 1))).mean()
-    # it wraps: latents rolled by windows give pixels rolled alike
-    rolled = sampling.decode(model, z.roll((8, 16), (2, 3)), quiet, margin=2)
-    assert np.allclose(rolled, np.roll(tiled, (32, 64), (0, 1)), atol=1e-5)
+def test_the_sample_covers_small_textures_and_is_spread_over_large_ones():
+    for length in (9, 13, 16):
+        assert sorted(i for start, end in decoding._sample(length, 4) for i in range(start, end)) == list(range(length))
+    assert decoding._sample(32, 4) == [(2, 6), (10, 14), (18, 22), (26, 30)]
+
+
+def test_each_patch_for_itself_is_not_decoding_at_once(open_engine, monkeypatch):
+    """What the statistics are for: without them patches get a tone of their own."""
+    model = open_engine().model(quiet)
+    monkeypatch.setattr(decoding, "_seeing_all", lambda *a: contextlib.nullcontext())
+    z = latents_that_change(16)
+    tiled, whole = decoding.decode(model, z, quiet, 8), decoding.decode(model, z, quiet, 16)
+    assert np.abs(tiled - whole).mean() > 0.03 * whole.std()
+
+
+@pytest.mark.parametrize("patch", [16, 8])
+def test_decoded_textures_roll_with_their_latents(open_engine, monkeypatch, patch):
+    model = open_engine().model(quiet)
+    z = latents_that_change(16)
+    picture = decoding.decode(model, z, quiet, patch)
+    rolled = decoding.decode(model, z.roll((8, 8), (2, 3)), quiet, patch)
+    assert np.allclose(rolled, np.roll(picture, (32, 32), (0, 1)), atol=1e-5)
+    assert torus.wrap_ratio(picture) <= torus.WRAP_GATE
 
 
 def test_a_patch_decoder_without_context_is_seamless(open_engine):
@@ -420,7 +444,7 @@ def test_a_patch_decoder_without_context_is_seamless(open_engine):
     model.vae.decoder.conv_norm_out = torch.nn.Identity()
     model.vae.decoder.conv_act = torch.nn.Identity()
     z = torch.randn(1, 4, 13, 24, generator=torch.Generator().manual_seed(0)) * 0.02
-    tiled = sampling.decode(model, z, quiet)
+    tiled = decoding.decode(model, z, quiet, 8, 1)
     whole = (z[0, :3] / model.vae.config.scaling_factor * 0.3).repeat_interleave(4, 1).repeat_interleave(4, 2)
     assert np.allclose(tiled, (whole.permute(1, 2, 0).numpy() + 1) / 2, atol=1e-5)
 

@@ -1,9 +1,9 @@
 """Engine `diffusion`: Stable Diffusion learns the region as a concept and samples a tileable texture of it.
 
 The method of Lopes, Pizzati, de Charette (CVPR 2024), whole: crops -> LoRA-DreamBooth (`tuning`) -> noise rolling on
-the torus of latents, decoding patch by patch (`sampling`) -> what border seam is left is closed, the region's colour is
-matched, and of several samples the one nearest to the crops is kept. Needs weights and packages of the user's
-(docs/diffusion.md); nothing of either is imported with this module.
+the torus of latents (`sampling`) -> pixels patch by patch (`decoding`) -> what border seam is left is closed, the
+region's colour is matched, and of several samples the one nearest to the crops is kept. Needs weights and packages of
+the user's (docs/diffusion.md); nothing of either is imported with this module.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ import torch
 from ... import torus
 from ...errors import PaletteError
 from ...tensors import read_tensors, write_tensors
-from . import memory, sampling, tuning
+from . import decoding, memory, sampling, tuning
 from .model import Model, load, locate, require_packages
 from .settings import DiffusionSettings
 
@@ -186,7 +186,7 @@ class Engine:
             latents = sampling.sample_latents(
                 model, text, nothing, shape, steps, generator, self.settings, lambda f, m: progress(0.9 * f, m)
             )
-        pixels = sampling.decode(model, latents, lambda f, m: progress(0.9 + 0.09 * f, m))
+        pixels = decoding.decode(model, latents, lambda f, m: progress(0.9 + 0.09 * f, m))
         if colour is not None:
             pixels = sampling.match_colour(pixels, *colour)
         if torus.wrap_ratio(pixels) > torus.WRAP_GATE:

@@ -3,6 +3,7 @@
 import torch
 
 from ...errors import PaletteError
+from . import decoding
 from .model import PARTS, Model
 from .settings import DiffusionSettings
 
@@ -29,7 +30,7 @@ def needed(model: Model, settings: DiffusionSettings, side: int, tuning: bool = 
     # with guidance two pictures at once
     pictures = 1 if tuning else settings.batch * (2 if settings.guidance > 1 else 1)
     unet = (TUNING if tuning else SAMPLING) * side**2 * per_pixel * pictures
-    patch = (min(side, model.window) + 2) * model.factor
+    patch = (decoding.PATCH + 2 * decoding.MARGIN) * model.factor
     vae = DECODING * patch**2 * model.vae.config.block_out_channels[0]
     # learning, the text encoders work together with the UNet
     with_unet = weights["unet"] + unet + (sum(weights[name] for name in model.encoders) if tuning else 0)

@@ -8,10 +8,9 @@ so that the borders of the windows, where the UNet's padding shows, never lie tw
     x_(t-1) <- step(roll(e, -s), t, x_t)           any scheduler
 
 Few steps leave few shifts. There, features are rolled instead: every convolution gets a shift of its own, so that its
-padding lies elsewhere; the UNet then sees the whole torus at once. Decoding goes patch by patch, with a margin of
-latents around each that wraps, blended over it by linear ramps.
+padding lies elsewhere; the UNet then sees the whole torus at once. Last, the pixels: `decoding`.
 
-Sources: Lopes, Pizzati, de Charette 2024 (noise rolling, decoding); Vecchio 2024, StableMaterials (feature rolling);
+Sources: Lopes, Pizzati, de Charette 2024 (noise rolling); Vecchio 2024, StableMaterials (feature rolling);
 Ho and Salimans 2022 (guidance).
 """
 
@@ -23,21 +22,14 @@ import numpy as np
 import torch
 
 from ... import perceptual
+from .decoding import spans
 from .model import Model
 from .settings import DiffusionSettings
 
 Progress = Callable[[float, str], None]
 
-MARGIN = 1  # latents around a patch that is decoded
 COMPARED = 8  # crops, to choose between samples
 TAIL = 0.005  # of the grey values at either end, left out when colours are matched
-
-
-def spans(length: int, window: int) -> list[tuple[int, int]]:
-    """(start, end) of as few equal parts of a circle as are no longer than the window."""
-    count = -(-length // window)
-    edges = [round(i * length / count) for i in range(count + 1)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
 
 
 def windows(shape: tuple[int, int], window: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
@@ -135,49 +127,6 @@ def _rolled_features(unet, generator: torch.Generator):
     finally:
         for hook in hooks:
             hook.remove()
-
-
-@torch.no_grad()
-def decode(model: Model, latents: torch.Tensor, progress: Progress, margin: int = MARGIN) -> np.ndarray:
-    """The pixels (H, W, 3) float32 in [0, 1], encoded, of latents (1, 4, h, w); wraps.
-
-    Patches of at most a window and a margin around them that wraps: memory beyond the picture does not grow with it.
-    Neighbours are blended by linear ramps over the margins, which lie over each other.
-    """
-    h, w = latents.shape[2:]
-    f = model.factor
-    config = model.vae.config
-    z = latents / config.scaling_factor + (getattr(config, "shift_factor", None) or 0)
-    rows, columns = spans(h, model.window), spans(w, model.window)
-    picture = torch.zeros(3, h * f, w * f)
-    done, count = 0, len(rows) * len(columns)
-    with model.at_work("vae"), torch.autocast(model.device.type, enabled=False):
-        for top, bottom in rows:
-            y, weight_y = _ramped(top, bottom, margin, f)
-            band = torch.zeros(3, len(y), w * f)
-            for left, right in columns:
-                model.beat = lambda done=done: progress(done / count, "decoding the texture")
-                model.beat()
-                x, weight_x = _ramped(left, right, margin, f)
-                r, c = (torch.arange(a - margin, b + margin) for a, b in ((top, bottom), (left, right)))
-                patch = z[:, :, (r % h)[:, None], c % w].to(model.device)
-                patch = model.vae.decode(patch, return_dict=False)[0][0].float().cpu()
-                # columns of a patch as wide as the torus come twice: index_add_ adds both
-                band.index_add_(2, x % (w * f), patch * (weight_y[:, None] * weight_x))
-                done += 1
-            picture.index_add_(1, y % (h * f), band)
-    model.beat = lambda: None
-    return picture.add_(1).div_(2).clamp_(0, 1).permute(1, 2, 0).contiguous().numpy()
-
-
-def _ramped(start: int, end: int, margin: int, f: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lines of a patch with its margins, in pixels, and their weights; those of neighbours add up to 1."""
-    lines = torch.arange((start - margin) * f, (end + margin) * f)
-    overlap = 2 * margin * f
-    if not margin:
-        return lines, torch.ones(len(lines))
-    nearest = torch.minimum(lines - lines[0], lines[-1] - lines) + 0.5
-    return lines, (nearest / overlap).clamp_max(1)
 
 
 def distance(texture: np.ndarray, crops: np.ndarray) -> float:
