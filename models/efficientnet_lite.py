@@ -48,13 +48,15 @@ class EfficientNetLite0(nn.Module):
                 channels_in = channels
         self.blocks = nn.ModuleList(blocks)
 
-    def forward(self, pixels: torch.Tensor) -> list[torch.Tensor]:
-        """Features of (B, 3, H, W) sRGB-encoded pixels in [0, 1], H and W multiples of 32: five maps, see CHANNELS."""
+    def forward(self, pixels: torch.Tensor, depth: int = 5) -> list[torch.Tensor]:
+        """Features of (B, 3, H, W) sRGB-encoded pixels in [0, 1], sides multiples of 32: `depth` maps of CHANNELS."""
         x = F.relu6(self.stem(_padded(2 * pixels - 1, self.stem)))
         maps = []
         for block in self.blocks:
             if block.depthwise.stride[0] == 2:
                 maps.append(x)
+                if len(maps) == depth:
+                    return maps
             x = block(x)
         return [*maps, x]
 

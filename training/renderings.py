@@ -13,6 +13,9 @@ from material_palette.core.torus import integrate
 from materials import MaterialSet
 
 MOST_SLOPE = 4.0
+# deviation of the logarithm of exposure: nothing in a picture tells it from a brighter material, so the albedo keeps
+# the photo's. A network that expects more of it draws bright and dark materials to the mean of what it knows
+EXPOSURE = 0.04
 
 
 class Source:
@@ -25,6 +28,9 @@ class Source:
         self.sets, self.size, self.most_scale = sets, size, most_scale
         self.random = np.random.default_rng(seed)
         self.heights = [relief(s.normal) for s in sets]
+
+    def replace(self, index: int, by: MaterialSet) -> None:
+        self.sets[index], self.heights[index] = by, relief(by.normal)
 
     def crop(self, index: int) -> dict[str, np.ndarray]:
         """albedo (S, S, 3) linear, slope (S, S, 2) = d height/dx, /d row, height (S, S) in pixels, roughness,
@@ -71,6 +77,12 @@ class Source:
         if random.random() < 0.4:
             strength = np.float32(np.exp(random.uniform(np.log(0.3), np.log(1.5))))
             crop["slope"], crop["height"] = crop["slope"] * strength, crop["height"] * strength
+        if random.random() < 0.15:
+            # nearly nothing to see: paint, plaster, film; otherwise what it gives there is anybody's guess
+            level = crop["albedo"].mean((0, 1))
+            crop["albedo"] = level + (crop["albedo"] - level) * np.float32(random.uniform(0, 0.6))
+            flatter = np.float32(random.uniform(0, 0.5))
+            crop["slope"], crop["height"] = crop["slope"] * flatter, crop["height"] * flatter
         return crop
 
     def _blobs(self) -> np.ndarray:
@@ -143,7 +155,7 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
     view = _unit(last(aside) - place)
     total = torch.zeros_like(albedo)
     weight = torch.zeros(count, 1, 1, 1)
-    for lamp in range(2 if random.random() < 0.33 else 1):
+    for lamp in range(2 if random.random() < 0.2 else 1):
         azimuth, elevation = uniform(0, 2 * np.pi, 1), uniform(0.35, 1.0, 1)
         flat = torch.sqrt(1 - elevation**2)
         direction = last(torch.cat([torch.cos(azimuth) * flat, torch.sin(azimuth) * flat, elevation], 1))
@@ -152,7 +164,7 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
         to_lamp = direction * distance - place
         falloff = distance**2 / to_lamp.square().sum(-1, keepdim=True)
         colour = last(torch.exp(0.08 * torch.randn(count, 3, 1, 1, generator=generator)))
-        share = last(uniform(0.0, 1.0, 1) if lamp == 0 else uniform(0.1, 0.6, 1))
+        share = last(uniform(0.1, 1.2, 1) if lamp == 0 else uniform(0.1, 0.6, 1))
         lit = brdf.shade(albedo, normal, roughness, _unit(to_lamp), view, metallic) * falloff
         cosine = direction[..., 2:]
         total = total + share * colour * lit / cosine
@@ -160,7 +172,8 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
     # the sky: what a normal sees of the hemisphere, less in crevices; a mirror sees it too
     height = batch["height"][:, 0]
     hidden = sum((_blurred(height, sigma) - height).clamp_min(0) / sigma for sigma in (1.5, 4.0, 12.0))
-    crevices = torch.exp(-uniform(0.0, 2.5) * hidden)[..., None]
+    # in half of the pictures there are none
+    crevices = torch.exp(-uniform(-2.5, 2.5).clamp_min(0) * hidden)[..., None]
     tilt = _unit(last(torch.cat([uniform(-0.5, 0.5, 2), torch.ones(count, 1, 1, 1)], 1)))
     open_sky = 0.5 + 0.5 * (normal * tilt).sum(-1, keepdim=True)
     dielectric = albedo * (1 - metallic[..., None]) + brdf.F0
@@ -170,7 +183,7 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
     # exposure, and what is left of vignetting and of illumination after it was flattened
     drift = torch.randn(count, 1, 3, 3, generator=generator)
     drift = F.interpolate(drift, (size, size), mode="bicubic", align_corners=True)[:, 0, ..., None]
-    exposure = torch.exp(-0.05 + 0.3 * torch.randn(count, 1, 1, 1, generator=generator))
+    exposure = torch.exp(EXPOSURE * torch.randn(count, 1, 1, 1, generator=generator))
     total = total * exposure * torch.exp(0.06 * drift)
     return torch.stack([torch.from_numpy(_camera(x, random)) for x in total.numpy()]).movedim(-1, 1)
 
@@ -180,7 +193,7 @@ def _camera(linear: np.ndarray, random: np.random.Generator) -> np.ndarray:
     if random.random() < 0.4:
         linear = cv2.GaussianBlur(linear, (0, 0), random.uniform(0.3, 1.0))
     if random.random() < 0.5:
-        deviation = random.uniform(0, 0.02) * np.sqrt(np.maximum(linear, 0.01))
+        deviation = random.uniform(0, 0.01) * np.sqrt(np.maximum(linear, 0.01))
         linear = linear + random.standard_normal(linear.shape, np.float32) * deviation
     encoded = srgb_from_linear(np.clip(linear, 0, 1).astype(np.float32))
     if random.random() < 0.4:

@@ -1,10 +1,12 @@
 """Fits how rough a material is on the whole: ridge regression on the pretrained trunk's features of its pictures.
 
-    .venv/bin/python training/roughness.py DATA WEIGHTS.safetensors [--procedural N]
+    .venv/bin/python training/roughness.py DATA WEIGHTS.safetensors
 
 There are a few dozen real materials to learn it from, which gradient descent learns by heart; a linear map in closed
-form, its penalty chosen on materials left out, does not. Procedural materials are added, since they are endless. Prints
-the error on materials left out and held out beside the constant's, and writes `mean_roughness` into WEIGHTS.
+form does not. Its penalty, the layers it sees, the weight of procedural materials (about the level of the real ones)
+and of large collections were chosen on training materials left out, and on whole collections left out: what is new to
+a user comes from a collection that is not here. Prints the error on both beside the constant's, and writes
+`mean_roughness` into WEIGHTS.
 """
 
 import argparse
@@ -19,81 +21,84 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
-from material_palette.core.decomposition.unet import load  # noqa: E402
 from material_palette.core.tensors import read_tensors, write_tensors  # noqa: E402
 from material_palette.models.svbrdf_net import SvbrdfNet  # noqa: E402
 from materials import MaterialSet, read_sets  # noqa: E402
 from renderings import Source, photographed, stacked  # noqa: E402
 from train import procedural_sets  # noqa: E402
 
-SIZE = 256  # px of a picture
-PICTURES = {"training": 10, "procedural": 2, "held out": 6}  # of each material
-PROCEDURAL_WEIGHT = 2.0
-PENALTIES = (100, 300, 1000, 3000, 10_000, 30_000)
-FOLDS = 8
+SIZE = 256  # px of a picture, as `core.decomposition.unet.OVERVIEW`
+PICTURES = 5  # of each real material; of a procedural one, one
+PROCEDURAL = 240
+PENALTY = 1.0  # in units of the features' variance
+FOLDS = 9
 
 
 def described(net: SvbrdfNet, sets: list[MaterialSet], pictures: int, seed: int) -> tuple[np.ndarray, ...]:
-    """Features (N, GLOBAL), mean roughness (N,) and number of the material (N,) of random pictures."""
+    """Features (N, TEXTURE), mean roughness (N,) and number of the material (N,) of random pictures."""
     source, random = Source(sets, SIZE, seed, most_scale=4.0), np.random.default_rng(seed)
     features, roughness, numbers = [], [], []
     for _ in range(pictures):
         for first in range(0, len(sets), 8):
             some = range(first, min(first + 8, len(sets)))
             batch = stacked([source.crop(i) for i in some])
-            features.append(net.describe(photographed(batch, random)).numpy())
+            features.append(net.recognise(photographed(batch, random))[1].numpy())
             roughness.append(batch["roughness"].mean((1, 2, 3)).numpy())
             numbers.append(np.array(some))
-    return tuple(np.concatenate(x).astype(np.float64) for x in (features, roughness, numbers))
+    return tuple(np.concatenate(x) for x in (features, roughness, numbers))
 
 
-def ridge(x: np.ndarray, y: np.ndarray, weight: np.ndarray, penalty: float) -> np.ndarray:
-    return np.linalg.solve(x.T @ (x * weight[:, None]) + penalty * np.eye(x.shape[1]), x.T @ (y * weight))
+def fit(x: np.ndarray, y: np.ndarray, weight: np.ndarray, drawn: tuple) -> tuple[np.ndarray, float]:
+    """Weights and bias of a ridge regression; `drawn`, features and roughness, counts as much as the rest together."""
+    level = np.average(y, weights=weight)
+    features, roughness = drawn
+    share = np.concatenate([weight / weight.sum(), np.full(len(features), 1 / len(features))]) / 2
+    target = np.concatenate([y - level, roughness - roughness.mean()])
+    x = np.concatenate([x, features]).astype(np.float64)
+    mean, deviation = share @ x, x.std(0) + 1e-3
+    z = (x - mean) / deviation
+    w = np.linalg.solve(z.T @ (z * share[:, None]) + PENALTY * np.eye(z.shape[1]), z.T @ (share * target)) / deviation
+    return w, float(level - mean @ w)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--procedural", type=int, default=600)
-    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    net = load(options.weights)
-    training, held_out = read_sets(options.data)
-    drawn = procedural_sets(options.procedural, options.seed + 1)
-    x, y, number = described(net, training, PICTURES["training"], options.seed)
-    px, py, _ = described(net, drawn, PICTURES["procedural"], options.seed + 1)
-    tx, ty, tnumber = described(net, held_out, PICTURES["held out"], options.seed + 2)
-
-    mean, deviation = x.mean(0), (x.std(0) + 1e-3) * np.sqrt(10)
-    level = y.mean()
-    x, px, tx = ((a - mean) / deviation for a in (x, px, tx))
-    both, target = np.concatenate([x, px]), np.concatenate([y, py]) - level
-    weight = np.concatenate([np.ones(len(y)), np.full(len(py), PROCEDURAL_WEIGHT)])
-    fold = np.random.default_rng(0).permutation(len(training))[number.astype(int)] % FOLDS
-    fold = np.concatenate([fold, np.full(len(py), -1)])
-
-    def left_out(penalty: float) -> float:
-        errors = []
-        for i in range(FOLDS):
-            w = ridge(both[fold != i], target[fold != i], weight[fold != i], penalty)
-            errors.append((both[fold == i] @ w - target[fold == i]) ** 2)
-        return float(np.concatenate(errors).mean())
-
-    tried = {penalty: left_out(penalty) for penalty in PENALTIES}
-    best = min(tried, key=tried.get)
-    w = ridge(both, target, weight, best)
-    found = tx @ w + level
-    haven = np.array([held_out[int(i)].name.startswith("polyhaven/") for i in tnumber])
-    print(f"left out: {tried[best]:.4f}, constant {y.var():.4f} (penalty {best})")
-    for name, some in (("held out", np.ones(len(ty), bool)), ("of these polyhaven", haven)):
-        error, constant = ((found - ty)[some] ** 2).mean(), ((level - ty)[some] ** 2).mean()
-        print(f"{name}: {error:.4f}, constant {constant:.4f}")
-
     tensors, metadata = read_tensors(options.weights)
-    tensors["mean_roughness.weight"] = (w / deviation)[None].astype(np.float32)
-    tensors["mean_roughness.bias"] = np.array([level - (mean / deviation) @ w], np.float32)
+    net = SvbrdfNet().eval()
+    net.trunk.load_state_dict(
+        {
+            name.removeprefix("trunk."): torch.from_numpy(x.astype(np.float32))
+            for name, x in tensors.items()
+            if name.startswith("trunk.")
+        }
+    )
+    training, _ = read_sets(options.data)
+    x, y, number = described(net, training, PICTURES, 0)
+    drawn = described(net, procedural_sets(PROCEDURAL, 77), 1, 1)[:2]
+    collection = np.array([s.name.split("/")[0] for s in training])
+    size = np.array([(collection == c).sum() for c in collection])
+    weight = size[number] ** -0.5
+
+    def left_out(fold: np.ndarray) -> tuple[float, float]:
+        errors = []
+        for group in np.unique(fold):
+            out = fold[number] == group
+            w, bias = fit(x[~out], y[~out], weight[~out], drawn)
+            errors.append([(x[out] @ w + bias - y[out]) ** 2, (y[~out].mean() - y[out]) ** 2])
+        found, constant = (np.concatenate(e).mean() for e in zip(*errors, strict=True))
+        return float(found), float(constant)
+
+    folds = np.random.default_rng(0).permutation(len(training)) % FOLDS
+    for name, fold in (("materials", folds), ("collections", np.unique(collection, return_inverse=True)[1])):
+        found, constant = left_out(fold)
+        print(f"{name} left out: {found:.4f}, constant {constant:.4f}")
+    w, bias = fit(x, y, weight, drawn)
+    tensors["mean_roughness.weight"] = w[None].astype(np.float32)
+    tensors["mean_roughness.bias"] = np.array([bias], np.float32)
     write_tensors(options.weights, tensors, metadata)
 
 

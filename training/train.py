@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -33,11 +32,13 @@ from renderings import Source, normal_of, photographed, stacked, turned  # noqa:
 
 SIZE, BATCH = 128, 16
 RATE, WARM_UP = 1e-3, 300
-AVERAGE = 0.999  # of the weights, per step
-EVERY = 500  # steps between checkpoints
-REAL = 0.6  # share of real materials beside procedural ones
-FRESH, KEPT = 0.34, 96  # share of steps that see a new batch; batches kept for the others, which see them turned
+AVERAGE = 0.998  # of the weights, per step
+EVERY = 250  # steps between checkpoints
+REAL = 0.75  # share of real materials beside procedural ones
+FRESH, KEPT = 0.3, 128  # share of steps that see a new batch; batches kept for the others, which see them turned
+NEW = 4  # procedural materials that take the place of others whenever a batch of them is drawn
 PROCEDURAL_SIZE = 384
+WATCHED = 6  # every so many-th training set is left out: it shows when learning by heart begins
 
 
 def linear(encoded: torch.Tensor) -> torch.Tensor:
@@ -52,17 +53,19 @@ def answers(out: dict[str, torch.Tensor], pixels: torch.Tensor) -> dict[str, tor
     return {
         "albedo": (linear(pixels).clamp_min(1e-3) * torch.exp(out["gain"])).clamp(0, 1),
         "normal": normal_of(out["slope"]),
-        "roughness": out["roughness"] - out["roughness"].mean((2, 3), keepdim=True),
     }
 
 
 def losses(found: dict, batch: dict, generator: torch.Generator) -> dict[str, torch.Tensor]:
     truth = normal_of(batch["slope"])
-    varied = batch["roughness"] - batch["roughness"].mean((2, 3), keepdim=True)
+    # a few steep crops must not decide every step
+    steepness = truth[:, :2].square().sum(1, keepdim=True).mean((2, 3), keepdim=True)
+    known = batch["known"] * (0.04 / (0.01 + steepness)).sqrt()
+    # squared errors, as measured: what is uncertain becomes its mean, not a guess
     return {
-        "albedo": (encoded(found["albedo"]) - encoded(batch["albedo"])).abs().mean(),
-        "normal": (F.smooth_l1_loss(found["normal"], truth, beta=0.2, reduction="none") * batch["known"]).mean() * 2,
-        "roughness": F.smooth_l1_loss(found["roughness"], varied, beta=0.1),
+        "albedo": (encoded(found["albedo"]) - encoded(batch["albedo"])).square().mean(),
+        "linear": (found["albedo"] - batch["albedo"]).square().mean(),
+        "normal": ((found["normal"] - truth).square() * known).mean(),
         "rendering": _rendering_loss(found, truth, batch, generator),
     }
 
@@ -70,7 +73,7 @@ def losses(found: dict, batch: dict, generator: torch.Generator) -> dict[str, to
 def _rendering_loss(found: dict, truth: torch.Tensor, batch: dict, generator: torch.Generator) -> torch.Tensor:
     """L1 between logarithms of renderings of a part of the crop, in a mirror-like or a random set-up.
 
-    Source: Deschaintre et al. 2018. Roughness is the truth's on both sides: its mean is not this network's.
+    Source: Deschaintre et al. 2018. Roughness is the truth's on both sides: it is found apart, by `roughness.py`.
     """
     count, _, size, _ = truth.shape
     half = size // 2
@@ -97,15 +100,18 @@ def _rendering_loss(found: dict, truth: torch.Tensor, batch: dict, generator: to
     return ((pictures[0] - pictures[1]).abs() * last(batch["known"])).mean()
 
 
-WEIGHTS = {"albedo": 1.0, "normal": 1.0, "roughness": 1.0, "rendering": 0.1}
+WEIGHTS = {"albedo": 10.0, "linear": 40.0, "normal": 40.0, "rendering": 0.5}
 
 
 def procedural_sets(count: int, seed: int) -> list[MaterialSet]:
     sets = []
     for i in range(count):
-        m = procedural.material(seed * 1_000_003 + i, PROCEDURAL_SIZE)
-        sets.append(MaterialSet(f"procedural/{i}", *_bytes(m), True))
+        sets.append(procedural_set(seed * 1_000_003 + i))
     return sets
+
+
+def procedural_set(seed: int) -> MaterialSet:
+    return MaterialSet(f"procedural/{seed}", *_bytes(procedural.material(seed, PROCEDURAL_SIZE)), True)
 
 
 def _bytes(m) -> tuple[np.ndarray, ...]:
@@ -165,14 +171,8 @@ def validate(run: Run, pictures: list) -> dict[str, float]:
     sums: dict[str, float] = {}
     for batch, pixels in pictures:
         found = answers(run.net(pixels), pixels)
-        nothing = answers(
-            {k: torch.zeros_like(pixels[:, :n]) for k, n in (("gain", 3), ("slope", 2), ("roughness", 1))}, pixels
-        )
-        truth = {
-            "albedo": batch["albedo"],
-            "normal": normal_of(batch["slope"]),
-            "roughness": batch["roughness"] - batch["roughness"].mean((2, 3), keepdim=True),
-        }
+        nothing = answers({k: torch.zeros_like(pixels[:, :n]) for k, n in (("gain", 3), ("slope", 2))}, pixels)
+        truth = {"albedo": batch["albedo"], "normal": normal_of(batch["slope"])}
         for name in truth:
             weight = batch["known"] if name == "normal" else 1.0
             for kind, answer in (("found", found), ("nothing", nothing)):
@@ -180,7 +180,7 @@ def validate(run: Run, pictures: list) -> dict[str, float]:
                 sums[f"{name} {kind}"] = sums.get(f"{name} {kind}", 0.0) + error
     for name, p in run.learnt.items():
         p.copy_(kept[name])
-    return {name: sums[f"{name} found"] / sums[f"{name} nothing"] for name in ("albedo", "normal", "roughness")}
+    return {name: sums[f"{name} found"] / sums[f"{name} nothing"] for name in ("albedo", "normal")}
 
 
 def main() -> None:
@@ -195,10 +195,9 @@ def main() -> None:
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)
 
-    training, held_out = read_sets(options.data)
-    # a tenth of the training sets decides nothing but shows when learning by heart begins
-    validation = training[::10]
-    training = [s for i, s in enumerate(training) if i % 10]
+    training, _ = read_sets(options.data)
+    validation = training[::WATCHED]
+    training = [s for i, s in enumerate(training) if i % WATCHED]
     run = Run(options.trunk, options.seed)
     if (options.output / "checkpoint.pt").exists():
         run.load(options.output)
@@ -209,14 +208,12 @@ def main() -> None:
     if options.procedural:
         sources.append(Source(procedural_sets(options.procedural, seed), SIZE, seed + 1))
     random, generator = np.random.default_rng(seed + 2), torch.Generator().manual_seed(seed + 3)
-    pictures = []
-    for name, sets in (("validation", validation), ("held out", held_out)):
-        source, still = Source(sets, SIZE, 1), np.random.default_rng(2)
-        batches = [stacked([source.crop(i) for i in range(len(sets))]) for _ in range(3)]
-        pictures.append((name, [(batch, photographed(batch, still)) for batch in batches]))
+    source, still = Source(validation, SIZE, 1), np.random.default_rng(2)
+    pictures = [stacked([source.crop(i) for i in range(len(validation))]) for _ in range(6)]
+    pictures = [(batch, photographed(batch, still)) for batch in pictures]
     log = (options.output / "log.csv").open("a", newline="")
     table = csv.writer(log)
-    print(f"{len(training)} real sets to train, {len(validation)} to watch, {len(held_out)} held out", flush=True)
+    print(f"{len(training)} real sets to train, {len(validation)} to watch", flush=True)
 
     kept: dict[int, dict[str, torch.Tensor]] = {}
     start, sums = time.perf_counter(), dict.fromkeys(WEIGHTS, 0.0)
@@ -226,7 +223,11 @@ def main() -> None:
         for group in run.optimiser.param_groups:
             group["lr"] = rate
         if len(kept) < 8 or random.random() < FRESH:
-            batch = sources[0 if len(sources) == 1 or random.random() < REAL else 1].batch(BATCH)
+            source = sources[0 if len(sources) == 1 or random.random() < REAL else 1]
+            if source is not sources[0]:
+                for _ in range(NEW):
+                    source.replace(random.integers(len(source.sets)), procedural_set(int(random.integers(2**40))))
+            batch = source.batch(BATCH)
             batch["pixels"] = photographed(batch, random)
             kept[len(kept) if len(kept) < KEPT else random.integers(KEPT)] = batch
         batch = turned(kept[random.integers(len(kept))], random)
@@ -246,9 +247,8 @@ def main() -> None:
             sums[name] += float(part.detach())
         if run.step % EVERY == 0 or run.step == options.steps:
             run.seconds += time.perf_counter() - start
-            row = [run.step, round(run.seconds)] + [round(sums[name] / EVERY, 5) for name in WEIGHTS]
-            for _, batches in pictures:
-                row += [round(x, 4) for x in validate(run, batches).values()]
+            row = [run.step, round(run.seconds)] + [round(sums[name] / EVERY, 6) for name in WEIGHTS]
+            row += [round(x, 4) for x in validate(run, pictures).values()]
             print(*row, flush=True)
             table.writerow(row)
             log.flush()

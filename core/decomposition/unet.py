@@ -26,10 +26,12 @@ from ..torus import integrate, normal_from_height
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "svbrdf_net.safetensors"
 TILE = 512, 1024  # px, rows and columns
-HALO = 160  # px: what is farther away changes a pixel by less than a grey level of 255
-OVERVIEW = 384  # px: longer side of what the material is recognised in
+HALO = 96  # px: what is farther away changes a pixel by less than a grey level of 255
+OVERVIEW = 256  # px: longer side of what the material is recognised in
+SAMPLE = 192  # px: side of each of at most four samples of which the light is read
 STEEPEST = 4.0
 DARKEST = 1e-3  # linear, as in training
+FAINT = 0.03  # deviation of the encoded pixels below which there is ever less to see, and the network is believed less
 
 
 def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weights: Path = WEIGHTS) -> SVBRDF:
@@ -40,10 +42,12 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weigh
     texture = np.roll(texture, (-origin[0], -origin[1]), (0, 1))
     encoded = srgb_from_linear(np.clip(texture, 0, 1)).astype(np.float32)
     with torch.no_grad():
-        context = net.describe(_overview(encoded))
-        out = _tiled(net, encoded, context, progress)
-        mean = net.mean_roughness(context).clamp(0.05, 1).item()
+        material, kind = net.recognise(_overview(encoded))
+        whole = net.describe(_samples(encoded), material)
+        out = _tiled(net, encoded, whole, progress)
+        mean = net.mean_roughness(kind).clamp(0.05, 1).item()
     progress(0.8, "integrating the height")
+    out *= min(1.0, float(encoded.std((0, 1)).max()) / FAINT)
     gain, slope = out[..., :3], out[..., 3:].clamp(-STEEPEST, STEEPEST)
     albedo = (torch.from_numpy(texture).clamp_min(DARKEST) * torch.exp(gain)).clamp(0, 1)
     height = integrate(slope[..., 0], slope[..., 1]) / texture.shape[1]
@@ -83,7 +87,15 @@ def _overview(encoded: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(small).permute(2, 0, 1)[None].contiguous(memory_format=torch.channels_last)
 
 
-def _tiled(net: SvbrdfNet, encoded: np.ndarray, context: torch.Tensor, progress) -> torch.Tensor:
+def _samples(encoded: np.ndarray) -> torch.Tensor:
+    """(N, 3, SAMPLE, SAMPLE) at the texture's own resolution: as much of the torus as four samples cover."""
+    starts = ((0, side // 2) if side > SAMPLE else (0,) for side in encoded.shape[:2])
+    lines = [[np.arange(start, start + SAMPLE) for start in both] for both in starts]
+    parts = [encoded.take(r, 0, mode="wrap").take(c, 1, mode="wrap") for r in lines[0] for c in lines[1]]
+    return torch.from_numpy(np.stack(parts)).permute(0, 3, 1, 2).contiguous(memory_format=torch.channels_last)
+
+
+def _tiled(net: SvbrdfNet, encoded: np.ndarray, whole: torch.Tensor, progress) -> torch.Tensor:
     """Gain and slope of every pixel, (H, W, 5); tiles with a halo of what surrounds them on the torus."""
     height, width = encoded.shape[:2]
     out = torch.empty(height, width, 5)
@@ -97,7 +109,7 @@ def _tiled(net: SvbrdfNet, encoded: np.ndarray, context: torch.Tensor, progress)
         columns = np.arange(left - HALO, left + -(-w // STRIDE) * STRIDE + HALO) % width
         pixels = torch.from_numpy(encoded[rows[:, None], columns[None]]).permute(2, 0, 1)[None]
         with torch.no_grad():
-            found = net(pixels.contiguous(memory_format=torch.channels_last), context)
+            found = net(pixels.contiguous(memory_format=torch.channels_last), whole)
         inner = torch.cat([found["gain"], found["slope"]], 1)[0, :, HALO : HALO + h, HALO : HALO + w]
         out[top : top + h, left : left + w] = inner.permute(1, 2, 0)
 
