@@ -73,6 +73,8 @@ def find_light(
     )
     slow = _slow(grid - cast, inside, max(LEAST_SIGMA / scale, SMOOTHNESS * side))
     slow -= slow[inside].mean(0)
+    # beyond a thin region its trend goes anywhere
+    slow = np.clip(slow, slow[inside].min(0), slow[inside].max(0))
     whole = cv2.resize(slow, (w, h), interpolation=cv2.INTER_LINEAR)
     cast_there = np.zeros_like(whole)
     unsure, shaded = np.zeros((h, w), bool), 0.0

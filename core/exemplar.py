@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from .delighting import LUMINANCE as LUMINANCE
-from .delighting import find_light
+from .delighting import find_light, masked_blur
 from .image import srgb_from_linear
 from .outliers import find_foreign
 
@@ -20,6 +20,7 @@ BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
 PATCH = 7  # px: what an engine learns from at least
 LEAST_PATCHES = 400
 LEAST_LEFT = 0.2  # of the patches; with fewer left the exemplar would no longer stand for the region
+SPECK, HOLE = 5, 9  # px: side of the least square of white or black that is left out; smaller ones belong to a texture
 LEAST_SAID = 0.01  # of the region
 
 
@@ -67,7 +68,7 @@ def cut_exemplar(
         box = _fullest(mask, box)
         warnings.append(f"the region spreads over {w} x {h} px; the fullest {LARGEST} x {LARGEST} px of it are used")
     pixels, mask = np.ascontiguousarray(pixels[box]), np.ascontiguousarray(mask[box])
-    mask = _without_colourless(pixels, mask, warnings)
+    pixels, mask = _without_colourless(pixels, mask, warnings)
     shading = np.ones_like(pixels)
     if flatten:
         light = find_light(pixels, mask, lambda fraction: progress(0.4 * fraction, "evening the light"))
@@ -90,25 +91,40 @@ def cut_exemplar(
     return Exemplar(pixels, mask, shading, _uniform_colour(pixels, mask), warnings)
 
 
-def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> np.ndarray:
-    """The mask without what the camera saw as white or as black; appends to warnings."""
+def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and mask without what the camera saw as white or as black; appends to warnings.
+
+    White specks are filled from around them: left out they would take every patch that holds one with them. A joint or
+    a hole may be black; a black area is a failure.
+    """
     # a photo in floats goes on beyond 1
     white = CLIPPED if pixels[mask].max() <= 1.001 else np.inf
     for what, lost in (("over-exposed", (pixels >= white).any(-1)), ("under-exposed", (pixels <= BLACK).all(-1))):
         lost &= mask
-        if what == "under-exposed":  # a joint or a hole may be black; a black area is a failure
-            lost = cv2.morphologyEx(lost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((9, 9), np.uint8)) > 0
-        share = lost.sum() / mask.sum()
-        if not share:
-            continue
-        # what is next to it has been mixed with it by the lens and the file's compression
-        left = _less(mask, cv2.dilate(lost.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-        if left is mask:
-            warnings.append(f"{share:.0%} of the region is {what}; too little would be left without it: it is kept")
-        elif share > LEAST_SAID:
-            warnings.append(f"{share:.0%} of the region is {what} and left out")
-        mask = left
-    return mask
+        speck = SPECK if what == "over-exposed" else HOLE
+        area = cv2.morphologyEx(lost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((speck, speck), np.uint8)) > 0
+        share = area.sum() / mask.sum()
+        if share:
+            left = _less(mask, _widened(area))
+            if left is mask:
+                warnings.append(f"{share:.0%} of the region is {what}; too little would be left without it: it is kept")
+            elif share > LEAST_SAID:
+                warnings.append(f"{share:.0%} of the region is {what} and left out")
+            mask = left
+        specks = lost & ~_widened(area)
+        if what == "over-exposed" and specks.any():
+            share = specks.sum() / mask.sum()
+            if share > LEAST_SAID:
+                warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")
+            specks = mask & _widened(specks)
+            around = masked_blur(pixels, mask & ~specks, SPECK / 2)
+            pixels = np.where(specks[..., None] & (around.sum(-1, keepdims=True) > 0), around, pixels)
+    return pixels, mask
+
+
+def _widened(lost: np.ndarray) -> np.ndarray:
+    """With what is next to it, which has been mixed with it by the lens and the file's compression."""
+    return cv2.dilate(lost.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _less(mask: np.ndarray, dropped: np.ndarray) -> np.ndarray:
