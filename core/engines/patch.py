@@ -354,9 +354,13 @@ def _whole_periods(periods, size: tuple[int, int]) -> tuple[tuple[float, float],
 def _stretched(concept: Concept, stretch: tuple[float, float]) -> list[Level]:
     h, w = concept.mask.shape
     size = max(1, round(w * stretch[1])), max(1, round(h * stretch[0]))
-    pixels = np.clip(cv2.resize(concept.pixels, size, interpolation=cv2.INTER_CUBIC), 0, 1)
     mask = cv2.resize(concept.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return _levels(pixels, mask, lambda fraction, message: None)
+    pixels = cv2.resize(concept.pixels, size, interpolation=cv2.INTER_LANCZOS4)
+    # between the pixels it is blurred: the finest detail gets the contrast back that it had
+    smooth = cv2.GaussianBlur(pixels, (0, 0), 0.7)
+    had = (concept.pixels - cv2.GaussianBlur(concept.pixels, (0, 0), 0.7))[concept.mask].std(0)
+    pixels = smooth + (pixels - smooth) * (had / np.maximum((pixels - smooth)[mask].std(0), 1e-6))
+    return _levels(np.clip(pixels, 0, 1), mask, lambda fraction, message: None)
 
 
 class _Phases:
