@@ -3,6 +3,7 @@
 
     python3 dev.py demo    [arguments of extract]       a palette of the bundled photo, into demo/
     python3 dev.py extract PHOTO... -o DIR [...]        the extension's command line, without Blender
+    python3 dev.py resample CONCEPT... -o DIR [...]     its other command
     python3 dev.py test    [--quick] [arguments of pytest]
     python3 dev.py bench   [SUITE ...] [--data DIR] [--quick] [-o DIR]    seconds against accuracy, stability
     python3 dev.py package [--wheels | --wheels all]    the extension's zip, into dist/
@@ -354,6 +355,12 @@ def extract(arguments):
     return importlib.import_module("material_palette.core.command").main(["extract", *arguments])
 
 
+def resample(arguments):
+    import_libraries()
+    load_package()
+    return importlib.import_module("material_palette.core.command").main(["resample", *arguments])
+
+
 def demo(arguments):
     parser = argparse.ArgumentParser(prog="dev.py demo", description="Further arguments are those of extract.")
     parser.add_argument("-o", "--output", default=os.path.join(ROOT, "demo"), help="folder, written anew (demo/)")
@@ -523,7 +530,7 @@ def add_wheels(staging, which):
         file.write(text if found else text + "\n" + declared)
 
 
-COMMANDS = {"demo": demo, "extract": extract, "test": test, "bench": bench, "package": package}
+COMMANDS = {"demo": demo, "extract": extract, "resample": resample, "test": test, "bench": bench, "package": package}
 
 
 # ---------------------------------------------------------------- from the outside in

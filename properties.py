@@ -33,6 +33,7 @@ RECTIFY = (
     ("off", "Off", "Take every region as the photo shows it"),
 )
 RESOLUTION_RANGE = (64, 8192)
+SCALE_RANGE = (0.25, 8.0)
 # Paths that start with "//"; from Blender 4.5 on a property has to say that it takes them.
 _BLEND_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
 
@@ -81,8 +82,11 @@ def _relief(name):
 
 
 class MATERIAL_PALETTE_PG_controls(PropertyGroup):
-    """What an artist adjusts on an extracted material; nothing is stored here, all of it is in the node tree."""
+    """What an artist adjusts on an extracted material; it is not stored here, all of it is in the node tree."""
 
+    # what was learnt of the region, where it is kept: JSON, and the tensors' file in base 64, which any file can hold
+    concept: StringProperty(options={"HIDDEN"})
+    concept_tensors: StringProperty(options={"HIDDEN"})
     tile_size: FloatProperty(
         name="Tile Size",
         description="How wide one repeat of the texture is on a surface whose UV map is in metres",
@@ -209,6 +213,18 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         soft_max=4096,
         subtype="PIXEL",
         description="Width and height of every map",
+    )
+    scale: FloatProperty(
+        name="Scale",
+        default=1.0,
+        min=SCALE_RANGE[0],
+        max=SCALE_RANGE[1],
+        description="How much larger the texture is shown than in the photo; a tile then holds less of the surface",
+    )
+    keep_concepts: BoolProperty(
+        name="Keep Concepts",
+        description="Keep what is learnt of each region in its material, so that Resample makes it larger or varies it "
+        "without the photo. Adds about 6 bytes per pixel of the region to the file",
     )
     seed: IntProperty(name="Seed", min=0, description="The same seed gives the same textures, another one a variation")
     metres_per_tile: FloatProperty(

@@ -129,13 +129,7 @@ def _resample(arguments: argparse.Namespace) -> int:
     from .palette import Palette, Settings, resample_material, write_palette
     from .region import file_name
 
-    settings = Settings(
-        decomposer=arguments.decomposer,
-        quality=arguments.quality,
-        resolution=arguments.resolution,
-        seed=arguments.seed,
-        scale=arguments.scale,
-    )
+    settings = Settings(**_sampling(arguments))
     settings.check()
     for path in arguments.concepts:
         if path.resolve().is_relative_to(arguments.output.resolve()):
@@ -156,6 +150,11 @@ def _resample(arguments: argparse.Namespace) -> int:
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
     print(f"{len(palette.materials)} materials written to {arguments.output}", flush=True)
     return DONE
+
+
+def _sampling(arguments: argparse.Namespace) -> dict:
+    """The settings that both commands take."""
+    return {name: getattr(arguments, name) for name in ("decomposer", "quality", "resolution", "seed", "scale")}
 
 
 def _jobs(arguments: argparse.Namespace) -> list[tuple[Path, Path | None, Path]]:
@@ -181,17 +180,13 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
     from .region import add_geometry, parse_corners, parse_measure, read_regions
 
     settings = Settings(
+        **_sampling(arguments),
         engine=arguments.engine,
-        decomposer=arguments.decomposer,
-        quality=arguments.quality,
-        resolution=arguments.resolution,
-        seed=arguments.seed,
         rectify=arguments.rectify,
         flatten=not arguments.no_flatten,
         white_balance=arguments.white_balance,
         metres_per_tile=arguments.metres_per_tile,
         diffusion=_diffusion(arguments) if arguments.engine == "diffusion" else None,
-        scale=arguments.scale,
         keep_concepts=arguments.keep_concepts,
     )
     settings.check()

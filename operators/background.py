@@ -9,7 +9,7 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from ..core.job import Job
-from .setup import missing, missing_sentence
+from .setup import NeedsPackages, missing
 
 _TICK = 0.1  # seconds between two looks at the queue
 _REDRAW = 0.5  # seconds between two redraws: drawing takes the processor from the work
@@ -100,7 +100,20 @@ def forget_error():
     _error = ""
 
 
-class BackgroundOperator:
+class _Free:
+    needs_photo = True
+
+    @classmethod
+    def poll(cls, context):
+        sentence = "Material Palette is at work" if _current is not None else ""
+        if not sentence and cls.needs_photo and context.scene.material_palette.photo is None:
+            sentence = "Open a photo first"
+        if sentence:
+            cls.poll_message_set(sentence)
+        return not sentence
+
+
+class BackgroundOperator(NeedsPackages, _Free):
     """Mixin of an operator whose work runs on a `Job`.
 
     A subclass gives `prepare(context) -> work` (reads everything from bpy; `work(progress, send)` never touches it),
@@ -110,15 +123,6 @@ class BackgroundOperator:
     """
 
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        sentence = "Material Palette is at work" if _current is not None else missing_sentence()
-        if not sentence and context.scene.material_palette.photo is None:
-            sentence = "Open a photo first"
-        if sentence:
-            cls.poll_message_set(sentence)
-        return not sentence
 
     def receive(self, context, scene, value):
         pass

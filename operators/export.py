@@ -9,20 +9,20 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy.types import Operator
 
 from ..core.errors import PaletteError
-from .setup import missing_sentence
+from .setup import NeedsPackages
 
 
-class _ExportsPalette:
-    """Mixin: works on the palette's materials that are there."""
-
+class _NeedsPalette:
     @classmethod
     def poll(cls, context):
-        sentence = missing_sentence()
-        if not sentence and not any(entry.material for entry in context.scene.material_palette.palette):
-            sentence = "Extract a palette first"
-        if sentence:
-            cls.poll_message_set(sentence)
-        return not sentence
+        if any(entry.material for entry in context.scene.material_palette.palette):
+            return True
+        cls.poll_message_set("Extract a palette first")
+        return False
+
+
+class _ExportsPalette(NeedsPackages, _NeedsPalette):
+    """Mixin: works on the palette's materials that are there."""
 
     def materials(self, context):
         settings = context.scene.material_palette

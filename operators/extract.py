@@ -1,5 +1,6 @@
 """Extract Palette: the enabled regions of the photo become materials, on a background thread, one after the other."""
 
+import base64
 import contextlib
 import os
 import shutil
@@ -67,13 +68,15 @@ class _Order:
 class _Extracts(BackgroundOperator):
     """Mixin: `regions(context)` names what to extract, `seed(context)` with what."""
 
+    kept = None  # the concept as a material keeps it, where it is not learnt anew
+
     def prepare(self, context):
         settings = context.scene.material_palette
         order = _read_order(settings, self.regions(context), self.seed(context), self.is_whole)
         self.pack = settings.pack
         self.replaces_files = order.overwrite
         self.chosen = order.chosen
-        self.photo_name = order.photo_name
+        self.description = f"Extracted from {order.photo_name}"
         self.built = {}  # region key: session_uid of its material
         for region in settings.regions:
             if region.key in order.keys.values():
@@ -93,10 +96,11 @@ class _Extracts(BackgroundOperator):
             return
         material = nodes.build_material(made.record, made.folder, pack=self.pack, preview=made.preview)
         try:
-            nodes.mark_asset(material, f"Extracted from {self.photo_name}", settings.author, settings.licence)
+            nodes.mark_asset(material, self.description, settings.author, settings.licence)
         except BaseException:
             nodes.remove_material(material)
             raise
+        _keep_concept(material, made, self.kept)
         entry = put_in_palette(settings, made.key, material, not self.replaces_files)
         entry.name = made.record["name"]
         entry.seed = self.chosen["seed"]
@@ -124,7 +128,8 @@ class _Extracts(BackgroundOperator):
         failed = [made.record for made in result.made if made.record["status"] != "ok"]
         if len(failed) == len(result.made):
             raise PaletteError("No material was made. " + _say(failed))
-        history.add(self.chosen, [made.record for made in result.made])
+        if self.kept is None:
+            history.add(self.chosen, [made.record for made in result.made])
         said = f"{_count(len(result.made) - len(failed))} made"
         if result.cancelled:
             said = f"Cancelled: {_count(len(result.made) - len(failed))} finished before"
@@ -194,17 +199,72 @@ class MATERIAL_PALETTE_OT_vary(_Extracts, Operator):
         return active_entry(context.scene.material_palette).seed + 1
 
 
-def _read_order(settings, regions, seed, is_whole):
-    """Read from the scene what the worker needs; raises PaletteError naming what can't be used."""
-    chosen = {
-        "engine": settings.engine,
+class MATERIAL_PALETTE_OT_resample(_Extracts, Operator):
+    """Make the active material anew from what was kept of its region, at the resolution, quality and scale that are
+    chosen now. The photo isn't needed. It takes the place of the one before, which is kept to be compared"""
+
+    bl_idname = "material_palette.resample"
+    bl_label = "Resample"
+
+    variation: bpy.props.BoolProperty(
+        name="Variation", description="With the next seed, not the material's own", options={"SKIP_SAVE"}
+    )
+    needs_photo = False
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        entry = active_entry(context.scene.material_palette)
+        if entry is None or entry.material is None or not entry.material.material_palette.concept:
+            cls.poll_message_set("Nothing is kept of its region: turn on Keep Concepts, and extract it again")
+            return False
+        return True
+
+    def prepare(self, context):
+        settings = context.scene.material_palette
+        entry = active_entry(settings)
+        self.pack, self.replaces_files, self.built = settings.pack, False, {}
+        self.kept = entry.material.material_palette.concept, entry.material.material_palette.concept_tensors
+        asset = entry.material.asset_data
+        self.description = asset.description if asset else ""
+        self.chosen = _sampling(settings, entry.seed + self.variation)
+        folder = None if settings.pack else _unused(_output_folder(settings))
+        work = self.kept, entry.key, self.chosen, folder, bpy.app.tempdir
+        return lambda progress, send: _resample(*work, progress, send)
+
+
+def _sampling(settings, seed):
+    return {
         "quality": settings.quality,
         "resolution": settings.resolution,
+        "scale": settings.scale,
         "seed": seed,
+    }
+
+
+def _keep_concept(material, made, kept):
+    """Put the concept that was written beside a material's maps, or that it was sampled from, into the material."""
+    from ..core.region import file_name
+
+    name = file_name(made.record["name"])
+    path = made.folder / name / f"{name}_concept.json"
+    if kept is None and path.exists():
+        tensors = path.with_suffix(".safetensors").read_bytes()
+        kept = path.read_text(encoding="utf-8"), base64.b64encode(tensors).decode("ascii")
+    if kept is not None:
+        material.material_palette.concept, material.material_palette.concept_tensors = kept
+
+
+def _read_order(settings, regions, seed, is_whole):
+    """Read from the scene what the worker needs; raises PaletteError naming what can't be used."""
+    chosen = _sampling(settings, seed) | {
+        "engine": settings.engine,
         "rectify": settings.rectify,
         "flatten": settings.flatten,
         "white_balance": settings.white_balance,
         "metres_per_tile": settings.metres_per_tile,
+        "keep_concepts": settings.keep_concepts and settings.engine == "patch",
     }
     read = photo_reader(settings.photo)
     masks = _read_masks(settings, regions)
@@ -290,6 +350,29 @@ def _work(order, progress, send):
     return _Extracted(made, order.folder or staging, staging, order.folder is None, cancelled)
 
 
+def _resample(kept, key, chosen, folder, tempdir, progress, send):
+    """As `_work`, of a concept that a material keeps."""
+    progress(0.0, "Getting ready")
+    from ..core.output import staged
+    from ..core.palette import Palette, Settings, resample_material, write_material, write_palette
+    from ..core.region import file_name
+
+    settings = Settings(**chosen)
+    with tempfile.TemporaryDirectory(prefix="material_palette_", dir=tempdir) as beside:
+        path = Path(beside) / "concept.json"
+        path.write_text(kept[0], encoding="utf-8")
+        path.with_suffix(".safetensors").write_bytes(base64.b64decode(kept[1]))
+        material = resample_material(path, settings, lambda f, message: progress(_EXTRACTION * f, message))
+    with staged(folder, False) if folder else _temporary(tempdir) as staging:
+        record = write_material(material, staging / file_name(material.name))
+        made = _Made(key, record, staging, material.preview)
+        send(made)
+        if folder:
+            palette = Palette(None, "a kept concept", [], settings, [material])
+            write_palette(palette, staging, progress, {record["name"]: record})
+    return _Extracted([made], folder or staging, staging, folder is None)
+
+
 @contextlib.contextmanager
 def _temporary(tempdir):
     """A new folder that is removed when the body fails, else by whoever takes its content."""
@@ -362,4 +445,4 @@ def _say(failed):
     return "; ".join(f"Region '{record['name']}' failed: {record['error']}" for record in failed)
 
 
-CLASSES = (MATERIAL_PALETTE_OT_extract, MATERIAL_PALETTE_OT_vary)
+CLASSES = (MATERIAL_PALETTE_OT_extract, MATERIAL_PALETTE_OT_vary, MATERIAL_PALETTE_OT_resample)

@@ -8,7 +8,7 @@ from bpy.props import StringProperty
 from bpy.types import Operator
 
 from ..core.errors import PaletteError
-from .setup import missing_sentence
+from .setup import NeedsPackages, missing_sentence
 
 # Image.colorspace_settings names, with those of other configurations that mean the same.
 _SRGB = {"sRGB", "sRGB - Texture"}
@@ -136,7 +136,7 @@ def _upright_copy(path):
     return image
 
 
-class MATERIAL_PALETTE_OT_open_photo(Operator):
+class MATERIAL_PALETTE_OT_open_photo(NeedsPackages, Operator):
     """Open the photo that materials are extracted from"""
 
     bl_idname = "material_palette.open_photo"
@@ -146,13 +146,6 @@ class MATERIAL_PALETTE_OT_open_photo(Operator):
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-
-    @classmethod
-    def poll(cls, context):
-        sentence = missing_sentence()
-        if sentence:
-            cls.poll_message_set(sentence)
-        return not sentence
 
     def invoke(self, context, event):
         if self.filepath:

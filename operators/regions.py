@@ -10,7 +10,7 @@ from bpy.props import BoolProperty, StringProperty
 from bpy.types import Operator
 
 from ..core.errors import PaletteError
-from .setup import missing_sentence
+from .setup import NeedsPackages
 
 _GOLDEN_RATIO = 0.618034  # hues this far apart stay distinct however many there are
 
@@ -303,21 +303,12 @@ class _ChoosesFolder:
         return {"RUNNING_MODAL"}
 
 
-class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, Operator):
+class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, NeedsPackages, NeedsPhoto, Operator):
     """Add one region for each mask image of a folder, named after its file; any pixel that isn't black belongs"""
 
     bl_idname = "material_palette.import_masks"
     bl_label = "Import Masks"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        sentence = missing_sentence()
-        if not sentence and context.scene.material_palette.photo is None:
-            sentence = "Open a photo first"
-        if sentence:
-            cls.poll_message_set(sentence)
-        return not sentence
 
     def execute(self, context):
         from ..core.region import read_regions
@@ -340,21 +331,12 @@ class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, Operator):
         return {"FINISHED"}
 
 
-class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, Operator):
+class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, NeedsPackages, NeedsRegion, Operator):
     """Write every region's mask as NAME.png into a folder, to be edited or passed to the command line"""
 
     bl_idname = "material_palette.export_masks"
     bl_label = "Export Masks"
     bl_options = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context):
-        sentence = missing_sentence()
-        if not sentence and not context.scene.material_palette.regions:
-            sentence = "There is no region"
-        if sentence:
-            cls.poll_message_set(sentence)
-        return not sentence
 
     def execute(self, context):
         from ..core.image import write_image

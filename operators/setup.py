@@ -22,14 +22,14 @@ def missing_sentence():
 
 
 class NeedsPackages:
-    """Mixin, before another one with a `poll`: the packages have to be there."""
+    """Mixin, before others with a `poll`: the packages have to be there."""
 
     @classmethod
     def poll(cls, context):
         if missing_sentence():
             cls.poll_message_set(missing_sentence())
             return False
-        return super().poll(context)
+        return super().poll(context) if hasattr(super(), "poll") else True
 
 
 class MATERIAL_PALETTE_OT_copy_install_command(Operator):

@@ -188,11 +188,15 @@ class OptionsPanel:
         layout.active = not context.window_manager.material_palette_run.running
         column = layout.column()
         column.prop(settings, "seed")
+        column.prop(settings, "scale")
         column.prop(settings, "rectify")
         column.prop(settings, "focal_length")
         column.prop(settings, "flatten")
         column.prop(settings, "white_balance")
         layout.operator("material_palette.preview_exemplar", icon="IMAGE_BACKGROUND")
+        kept = column.row()
+        kept.active = settings.engine == "patch"
+        kept.prop(settings, "keep_concepts")
         column.prop(settings, "pack")
         if not settings.pack:
             column.prop(settings, "output_folder", text="Folder")
@@ -236,6 +240,8 @@ class PalettePanel:
             layout.operator("material_palette.delete_material", text="Remove from Palette", icon="TRASH")
         row = layout.row(align=True)
         row.operator("material_palette.vary", icon="FILE_REFRESH")
+        if entry.material is not None and entry.material.material_palette.concept:
+            row.operator("material_palette.resample", text="", icon="FULLSCREEN_ENTER")
         row.operator("material_palette.replace_material", text="Replace", icon="ARROW_LEFTRIGHT")
         if entry.previous is not None:
             row = layout.row(align=True)

@@ -244,6 +244,33 @@ def test_a_variation_has_another_seed_and_can_be_compared(ready, instant, data_b
     assert not bpy.ops.material_palette.vary.poll()
 
 
+def test_a_kept_concept_is_sampled_again_without_the_photo(ready, tmp_path, temporary_folders):
+    ready.regions[0].enabled, ready.keep_concepts, ready.seed = False, True, 3
+    bpy.ops.material_palette.extract()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
+    settings = bpy.context.scene.material_palette
+    settings.photo, settings.resolution, settings.scale = None, 128, 2.0
+    settings.regions.clear()
+    for variation in (False, True):
+        assert bpy.ops.material_palette.resample(variation=variation) == {"FINISHED"}
+        (entry,) = settings.palette
+        image = next(n for n in entry.material.node_tree.nodes if n.bl_idname == "ShaderNodeTexImage").image
+        assert tuple(image.size) == (128, 128) and image.packed_file
+        # twice the pixels at twice the scale: a tile of the same size
+        assert entry.material["metres_per_tile"] == pytest.approx(1.0)
+        assert entry.seed == 3 + variation and entry.previous is not None
+        assert "photo" in entry.material.asset_data.description
+    assert temporary_folders() == []
+    entry.material.material_palette.concept = "{}"
+    assert "holds no concept" in refused(bpy.ops.material_palette.resample)
+
+
+def test_without_a_kept_concept_resample_says_so(ready, instant):
+    bpy.ops.material_palette.extract()
+    assert not bpy.ops.material_palette.resample.poll()
+
+
 def test_deleting_a_material_deletes_its_images(ready, instant, data_blocks):
     before = data_blocks()
     bpy.ops.material_palette.extract()
@@ -374,7 +401,7 @@ class Modal:
     """Stands for the operator in a window, which background mode doesn't have."""
 
     bl_label = "Extract Palette"
-    only_active, is_whole = False, True
+    only_active, is_whole, kept = False, True, None
 
     def __init__(self):
         self.reports = []

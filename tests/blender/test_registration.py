@@ -91,6 +91,7 @@ def test_choices_are_those_of_the_pipeline(extension):
     assert tuple(identifier for identifier, *_ in properties.QUALITIES) == tuple(palette.QUALITIES)
     assert tuple(identifier for identifier, *_ in properties.WHITE_BALANCES) == palette.WHITE_BALANCES
     assert tuple(properties.RESOLUTION_RANGE) == tuple(palette.RESOLUTION_RANGE)
+    assert tuple(properties.SCALE_RANGE) == tuple(palette.SCALE_RANGE)
 
 
 def test_a_scene_keeps_its_settings_in_the_file(settings, tmp_path):
