@@ -1,7 +1,7 @@
 # Sourced once the window is ready: works as an artist does, and looks at the data and takes a picture after each step.
 # expect CONDITION SECONDS [quietly]: wait until the Python expression CONDITION of the state is true.
 expect() {
-  local condition=$1 seconds=$2 quietly=${3:-} start=$SECONDS
+  local condition=$1 seconds=$(($2 * ${PALETTE_PATIENCE:-1})) quietly=${3:-} start=$SECONDS
   while ! python3 - "$PALETTE_STATE" "$condition" <<'PY'
 import json, sys
 try:

@@ -2,7 +2,7 @@
 # The mouse moves as a user's does: Blender 4.3 drops the handler of an unregistered operator only with the next event,
 # and crashes when another one starts before.
 read -r x y w h <<<"$(region VIEW_3D WINDOW)"
-for ((i = 0; i < 900; i++)); do
+for ((i = 0; i < 900 * ${PALETTE_PATIENCE:-1}; i++)); do
   [ ! -e "$PALETTE_STATE" ] || break
   alive || { echo "Blender ended early" >&2; return 1; }
   xdo mousemove $((x + w / 4 + i % 2 * 20)) $((y + h / 2))

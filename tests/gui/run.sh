@@ -6,9 +6,10 @@
 # The story is a pair of files here: NAME.py runs in Blender, NAME.sh drives the window from outside.
 # artist, the default, also writes OUT-1-photo.png to OUT-9-assigned.png.
 # Exit code 0 when all went as expected. PALETTE_EXAMPLE: another folder with photo.jpg and masks/.
+# PALETTE_PATIENCE: a factor on all waits, for a busy machine (1).
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
-if [ $# -lt 2 ]; then sed -n '2,8s/^# \{0,1\}//p' "$0" >&2; exit 2; fi
+if [ $# -lt 2 ]; then sed -n '2,9s/^# \{0,1\}//p' "$0" >&2; exit 2; fi
 : "${BLENDER_GUI:?the path of blender_gui.sh}"
 
 name=${3:-artist}
@@ -17,7 +18,7 @@ mkdir -p "$(dirname "$2")"
 out=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")
 export PALETTE_PHOTO="$example/photo.jpg" PALETTE_MASKS="$example/masks" PALETTE_SHOT=$out PALETTE_STATE="$out.state.json"
 rm -f "$PALETTE_STATE"
-export BGUI_PASS="PALETTE_PHOTO PALETTE_MASKS PALETTE_STATE" BGUI_SHARE="$here:$example:$(dirname "$out")"
+export BGUI_PASS="PALETTE_PHOTO PALETTE_MASKS PALETTE_STATE PALETTE_PATIENCE" BGUI_SHARE="$here:$example:$(dirname "$out")"
 if [ "$name" != interrupt ]; then
   GUI_DRIVE="$here/$name.sh" exec "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out"
 fi

@@ -142,7 +142,8 @@ class Engine:
             if model.identity != concept.model:
                 raise PaletteError("the concept was learnt with another model; choose that one, or learn it again")
             shape = latent_shape(model, size)
-            stated = memory.fit(model, settings, max(shape) if settings.roll == "feature" else model.window)
+            seen = max(shape) if settings.roll == "feature" else model.window
+            stated = memory.fit(model, settings, seen, shape=shape)
             progress(0.0, f"sampling: {stated}")
             tuning.set_lora(model, concept.lora)
             best = None
@@ -171,9 +172,10 @@ class Engine:
         generator = torch.Generator().manual_seed(seed)
         with self._working(), torch.no_grad():
             model = self.model(progress)
-            memory.fit(model, self.settings, model.window)
+            shape = latent_shape(model, size)
+            memory.fit(model, self.settings, model.window, shape=shape)
             tuning.reset_lora(model)
-            texture = self._sample_once(model, prompt, None, latent_shape(model, size), steps, generator, progress)
+            texture = self._sample_once(model, prompt, None, shape, steps, generator, progress)
         texture.pixels = torus.resize(texture.pixels, size).clip(0, 1)
         return texture
 

@@ -71,6 +71,16 @@ def _sample(length: int, longest: int) -> list[tuple[int, int]]:
     return [(middle - side // 2, middle - side // 2 + side) for middle, side in found]
 
 
+def waiting(model: Model, shape: tuple[int, int]) -> int:
+    """Bytes in the computer's memory that the squares take at most, while a texture of latents (h, w) is decoded."""
+    if max(shape) <= PATCH:
+        return 0
+    counts = [len(_sample(side, PATCH // 2)) for side in shape]
+    pixels = ((PATCH // 2 + 2 * MARGIN) * model.factor) ** 2
+    # the last level begins with the channels of the one before, in full precision
+    return 4 * counts[0] * counts[1] * pixels * model.vae.config.block_out_channels[1]
+
+
 @contextlib.contextmanager
 def _circular(module: torch.nn.Module):
     """Convolutions that wrap."""
@@ -197,8 +207,8 @@ def _seeing_all(model: Model, patches: list[torch.Tensor], margin: int, report: 
                 normalise(layer, norm)
             if isinstance(getattr(layer, "group_norm", None), torch.nn.GroupNorm):
                 attend(layer)
-            if layer is not layers[-1]:
-                patches = [_run(layer, x.to(model.device)).cpu() for x in patches]
+            for i, x in enumerate(patches if layer is not layers[-1] else ()):
+                patches[i] = _run(layer, x.to(model.device)).cpu()
         yield
     finally:
         for layer in changed:

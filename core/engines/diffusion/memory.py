@@ -1,5 +1,7 @@
 """What a run will need of the device's memory: said before it starts, refused with a way out where it does not fit."""
 
+import math
+
 import torch
 
 from ...errors import PaletteError
@@ -11,8 +13,9 @@ GB = 1e9
 # bytes of activations per pixel of the latents, per channel of the UNet's first block, per byte of the precision
 SAMPLING = 60.0
 TUNING = 120.0
-# bytes per decoded pixel and channel of the VAE's first block, in full precision
-DECODING = 20.0
+# bytes per pixel and channel of the VAE's first block, in full precision
+DECODING = 45.0
+ENCODING = 25.0
 RESERVE = 0.3 * GB  # the device's own, and what the libraries hold
 WAY_OUT = (
     "close other programs, or lower: batch to 1, precision to fp16 or bf16, the model to one of SD 1.x; roll to noise; "
@@ -20,18 +23,28 @@ WAY_OUT = (
 )
 
 
-def needed(model: Model, settings: DiffusionSettings, side: int, tuning: bool = False) -> tuple[float, float]:
+def needed(
+    model: Model, settings: DiffusionSettings, side: int, tuning: bool = False, shape: tuple[int, int] | None = None
+) -> tuple[float, float]:
     """Bytes at the peak with all parts on the device, and with only the part at work there (offload).
 
-    side: of the latents that the UNet sees at once.
+    side: of the latents that the UNet sees at once; shape: of all latents, None: one window.
     """
     weights = {name: _bytes(model.parts[name]) for name in PARTS if name in model.parts}
     per_pixel = model.unet.config.block_out_channels[0] * torch.finfo(model.dtype).bits // 8
     # with guidance two pictures at once
     pictures = 1 if tuning else settings.batch * (2 if settings.guidance > 1 else 1)
     unet = (TUNING if tuning else SAMPLING) * side**2 * per_pixel * pictures
-    patch = (decoding.PATCH + 2 * decoding.MARGIN) * model.factor
-    vae = DECODING * patch**2 * model.vae.config.block_out_channels[0]
+    shape = shape or (side, side)
+    if tuning:
+        vae = ENCODING * (side * model.factor) ** 2
+    elif max(shape) <= decoding.PATCH:
+        vae = DECODING * math.prod(shape) * model.factor**2
+    else:
+        vae = DECODING * ((decoding.PATCH + 2 * decoding.MARGIN) * model.factor) ** 2
+    vae *= model.vae.config.block_out_channels[0]
+    if model.device.type == "cpu" and not tuning:
+        vae += decoding.waiting(model, shape)
     # learning, the text encoders work together with the UNet
     with_unet = weights["unet"] + unet + (sum(weights[name] for name in model.encoders) if tuning else 0)
     return sum(weights.values()) + max(unet, vae) + RESERVE, max(with_unet, weights["vae"] + vae) + RESERVE
@@ -52,9 +65,11 @@ def free(model: Model) -> float:
     return psutil.virtual_memory().available + sum(_bytes(model.parts[name]) for name in PARTS if name in model.parts)
 
 
-def fit(model: Model, settings: DiffusionSettings, side: int, tuning: bool = False) -> str:
+def fit(
+    model: Model, settings: DiffusionSettings, side: int, tuning: bool = False, shape: tuple[int, int] | None = None
+) -> str:
     """Decide on offloading and say what the run will need. Raises PaletteError when it does not fit."""
-    whole, alone = needed(model, settings, side, tuning)
+    whole, alone = needed(model, settings, side, tuning, shape)
     there = free(model)
     # on the CPU the weights have nowhere else to go
     may_offload = model.device.type != "cpu"
