@@ -117,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         each.add_argument("--resolution", type=int, default=1024, metavar="PX", help="side of the maps (%(default)s)")
         each.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
         each.add_argument("--scale", type=float, default=1.0, metavar="S", help="enlarge the texture S times (1)")
+        each.add_argument("--full-maps", action="store_true", help="reduce nothing: no value, no smaller map")
         each.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
         each.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
         each.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
@@ -143,6 +144,7 @@ def _resample(arguments: argparse.Namespace) -> int:
                 raise PaletteError(f"two concepts are named '{material.name}'; resample them into separate folders")
             palette.materials.append(material)
             line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
+            line.ledger(material.name, material.reduced)
             for warning in material.warnings:
                 line.say(f"{material.name}: warning: {warning}")
         content = write_palette(palette, staging)
@@ -154,7 +156,8 @@ def _resample(arguments: argparse.Namespace) -> int:
 
 def _sampling(arguments: argparse.Namespace) -> dict:
     """The settings that both commands take."""
-    return {name: getattr(arguments, name) for name in ("decomposer", "quality", "resolution", "seed", "scale")}
+    taken = ("decomposer", "quality", "resolution", "seed", "scale", "full_maps")
+    return {name: getattr(arguments, name) for name in taken}
 
 
 def _jobs(arguments: argparse.Namespace) -> list[tuple[Path, Path | None, Path]]:
@@ -223,6 +226,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
                 line.say(f"{material.name}: FAILED: {material.error}")
             else:
                 line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
+                line.ledger(material.name, material.reduced)
                 for warning in material.warnings:
                     line.say(f"{material.name}: warning: {warning}")
 
@@ -269,6 +273,12 @@ class _Line:
         if self._terminal:
             print("\r" + " " * 110 + "\r", end="", file=sys.stderr, flush=True)
         print(f"{self._name}: {text}", flush=True)
+
+    def ledger(self, name: str, reduced: list[dict]) -> None:
+        """What the material does without, what it would have cost and what error it makes."""
+        for e in reduced:
+            cost = f"saves {e['bytes'] / 1e6:.2f} MB, " if e["bytes"] else ""
+            self.say(f"{name}: reduced: {e['map']} {e['change']} ({cost}FLIP {e['flip']:.3f})")
 
 
 def _complain(error: PaletteError) -> None:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from .image import srgb_from_linear, write_image
+from .torus import resize
 
 
 def adjust_colour(albedo: np.ndarray, hue: float, saturation: float, brightness: float) -> np.ndarray:
@@ -35,15 +36,18 @@ def write_gltf_maps(folder: Path, name: str, maps: dict) -> list[str]:
     maps: "basecolor" (H, W, 3) linear or (3,), "normal" (H, W, 3) or None, "roughness" and "metallic" (H, W) or float.
     `<name>_orm.png` holds occlusion (none: 1), roughness and metallic in red, green and blue.
     """
-    shapes = [value.shape[:2] for value in maps.values() if np.ndim(value) > 1]
-    height, width = shapes[0] if shapes else (4, 4)
+    shapes = [value.shape[:2] for kind, value in maps.items() if np.ndim(value) > 1 and kind != "height"]
+    height, width = max(shapes) if shapes else (4, 4)
 
     def full(value):
-        return np.broadcast_to(np.asarray(value, np.float32), (height, width))
+        value = np.asarray(value, np.float32)
+        if value.ndim and value.shape != (height, width):  # maps have no more texels than they need
+            value = resize(value[..., None], (height, width))[..., 0]
+        return np.broadcast_to(value, (height, width))
 
-    base = np.broadcast_to(np.asarray(maps["basecolor"], np.float32), (height, width, 3))
+    base = np.asarray(maps["basecolor"], np.float32)
     pictures = {
-        "basecolor": np.clip(srgb_from_linear(base), 0, 1),
+        "basecolor": np.clip(srgb_from_linear(base if base.ndim > 1 else np.broadcast_to(base, (4, 4, 3))), 0, 1),
         "orm": np.stack([full(1.0), full(maps["roughness"]), full(maps["metallic"])], -1),
     }
     if maps.get("normal") is not None:

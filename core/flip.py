@@ -1,8 +1,8 @@
 """FLIP: how different two pictures look to somebody who flips between them, 0 to 1 per pixel.
 
-Source: Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating Images" (the LDR one). Colours are filtered
-as the eye does at a viewing distance and compared in a perceptually uniform space; edges and points that one picture has
-and the other lacks raise the difference. Constants are the paper's.
+Source: Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating Images" (the LDR one). Colours are
+filtered as the eye does at a viewing distance and compared in a perceptually uniform space; edges and points that one
+picture has and the other lacks raise the difference. Constants are the paper's.
 """
 
 import math

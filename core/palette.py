@@ -45,7 +45,8 @@ class Settings:
     the plane that is found, "quad" by its corners only, "off" never; flatten takes slow changes of light and cast
     shadows out of a region; white_balance "region" takes the region's mean for grey. scale is how much larger the
     texture is shown than the photo shows it; the tile's area shrinks by as much. keep_concepts: each material's concept
-    is kept and written, to sample others from. diffusion: settings of the engine of that name.
+    is kept and written, to sample others from. full_maps: nothing is reduced. diffusion: settings of the engine
+    of that name.
     """
 
     engine: str = "patch"
@@ -60,6 +61,7 @@ class Settings:
     diffusion: DiffusionSettings | None = None
     scale: float = 1.0
     keep_concepts: bool = False
+    full_maps: bool = False
 
     def check(self) -> None:
         """Raise PaletteError naming the first setting that cannot be honoured."""
@@ -108,14 +110,15 @@ class Material:
     """One region's outcome. status is "ok", or "failed" with the reason in error and no SVBRDF.
 
     exemplar (h, w, 3), dark where nothing is learnt from, and texture (H, W, 3) are sRGB-encoded uint8 for looking at;
-    preview (256, 256, 4) float32 is a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced says which
-    maps became values; rectification is the record for palette.json.
+    preview (256, 256, 4) float32 is a rendered sphere, sRGB-encoded RGBA; seconds are per stage; reduced is the
+    ledger of `reduction.reduce` and bits are those of the maps; rectification is the record for palette.json.
     """
 
     name: str
     status: str = "ok"
     svbrdf: SVBRDF | None = None
-    reduced: list[str] = field(default_factory=list)
+    reduced: list[dict] = field(default_factory=list)
+    bits: dict[str, int] = field(default_factory=lambda: dict.fromkeys(reduction.KINDS, 8))
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     error: str | None = None
@@ -251,7 +254,7 @@ def extract_material(
             }
             material.concept = tensors, facts
         svbrdf = _sample(material, engine, concept, settings, progress, learnt)
-    _finish(material, svbrdf, progress)
+    _finish(material, svbrdf, settings.full_maps, progress)
     return material
 
 
@@ -283,7 +286,7 @@ def resample_material(path: Path, settings: Settings, progress: Progress) -> Mat
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise PaletteError(f"'{path}' holds no concept that can be read ({error}); extract it again") from error
     with _one_thread_each():
-        _finish(material, _sample(material, engine, concept, settings, progress, 0.06), progress)
+        _finish(material, _sample(material, engine, concept, settings, progress, 0.06), settings.full_maps, progress)
     return material
 
 
@@ -300,11 +303,14 @@ def _sample(material: Material, engine, concept, settings: Settings, progress: P
         return decomposition.decompose(linear_from_srgb(pixels), _part(progress, 0.86, 0.96), settings.decomposer)
 
 
-def _finish(material: Material, svbrdf: SVBRDF, progress: Progress) -> None:
+def _finish(material: Material, svbrdf: SVBRDF, full_maps: bool, progress: Progress) -> None:
     seconds = material.seconds
-    progress(0.97, "reducing the maps")
     with _timed(seconds, "reduce"):
-        material.svbrdf, material.reduced = reduction.reduce(svbrdf)
+        material.svbrdf = svbrdf
+        if not full_maps:
+            found = reduction.reduce(svbrdf, _part(progress, 0.96, 0.99))
+            material.svbrdf, material.reduced, material.bits = found.svbrdf, found.ledger, found.bits
+            material.metres_per_tile /= found.parts
     with _timed(seconds, "preview"):
         sphere = brdf.render_sphere(material.svbrdf, PREVIEW)
         material.preview = np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
@@ -372,11 +378,11 @@ def write_material(material: Material, folder: Path) -> dict:
             write_image(folder / file, encoded, bits)
             record["maps"][kind] = {"file": f"{folder.name}/{file}", **more}
 
-    svbrdf = material.svbrdf
+    svbrdf, bits = material.svbrdf, material.bits
     is_map = svbrdf.albedo.ndim > 1
-    entry("basecolor", svbrdf.albedo, srgb_from_linear(svbrdf.albedo) if is_map else None)
-    entry("normal", svbrdf.normal, (svbrdf.normal + 1) / 2 if svbrdf.normal.ndim > 1 else None)
-    entry("roughness", svbrdf.roughness, svbrdf.roughness if np.ndim(svbrdf.roughness) else None)
+    entry("basecolor", svbrdf.albedo, srgb_from_linear(svbrdf.albedo) if is_map else None, bits["basecolor"])
+    entry("normal", svbrdf.normal, (svbrdf.normal + 1) / 2 if svbrdf.normal.ndim > 1 else None, bits["normal"])
+    entry("roughness", svbrdf.roughness, svbrdf.roughness if np.ndim(svbrdf.roughness) else None, bits["roughness"])
     if svbrdf.height is None:
         entry("height", 0.0, None)
     else:

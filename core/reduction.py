@@ -54,9 +54,7 @@ class Reduction:
     ledger: list[dict] = field(default_factory=list)
 
 
-def reduce(
-    svbrdf: SVBRDF, progress: Progress = lambda fraction, message: None, visible: float = VISIBLE
-) -> Reduction:
+def reduce(svbrdf: SVBRDF, progress: Progress = lambda fraction, message: None, visible: float = VISIBLE) -> Reduction:
     """The least maps that look like the given ones, which are constants or square and of one size, and what they save.
 
     visible: the error that may be made, FLIP in [0, 1].
@@ -277,7 +275,9 @@ def _rendered(maps: Maps, corner: tuple[int, int], side: int) -> list[np.ndarray
     normal = torch.nn.functional.normalize(normal, dim=-1)
     pictures = []
     for light, view in LIGHTS:
-        light, view = (torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view))
+        light, view = (
+            torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view)
+        )
         shaded = shade(albedo, normal, roughness, light.expand_as(normal), view.expand_as(normal)) / light[2]
         pictures.append(srgb_from_linear(shaded.clamp(0, 1).numpy()))
     return pictures

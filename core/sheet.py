@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from . import reduction
 from .image import srgb_from_linear
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def _material(material: "Material", colour: tuple[float, float, float], width: i
     # nothing that differs between two runs stands here: the same seed gives the same sheet
     note = material.name if material.status == "ok" else f"{material.name}   FAILED"
     if material.status == "ok" and material.reduced:
-        note += "   (" + "; ".join(material.reduced) + ")"
+        note += "   (" + "; ".join(reduction.say(material.reduced)) + ")"
     _text(row, note, GAP + 30, 21, 0.6)
     top = TITLE + 20
     if material.svbrdf is None:

@@ -12,7 +12,7 @@ from material_palette.core.region import Region
 from material_palette.core.torus import WRAP_GATE, wrap_ratio
 from textures import pebbles, quiet
 
-SETTINGS = Settings(quality="draft", resolution=128)
+SETTINGS = Settings(quality="draft", resolution=128, full_maps=True)
 PAINT = np.array([0.5, 0.1, 0.08], np.float32)
 
 

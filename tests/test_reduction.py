@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
+import torch
 from material_palette.core import reduction
 from material_palette.core.errors import Cancelled
 from material_palette.core.material import SVBRDF
 from material_palette.core.reduction import reduce, shrink
 from material_palette.core.torus import normal_from_height, wrap_ratio
 from textures import tileable_noise
-
-import torch
 
 N = 128
 FLAT = np.broadcast_to(np.array([0, 0, 1], np.float32), (N, N, 3))
