@@ -33,6 +33,8 @@ def main(argv: list[str]) -> int:
     try:
         if arguments.command == "resample":
             return _resample(arguments)
+        if arguments.command == "fit":
+            return _fit(arguments)
         for photo, masks, folder in _jobs(arguments):
             try:
                 codes.append(_extract(photo, masks, folder, arguments))
@@ -50,7 +52,7 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("material_palette", description="Tileable PBR materials from a photo's regions.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="extract | resample")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="extract | resample | fit")
     extract = commands.add_parser("extract", help="make a palette of each photo")
     extract.add_argument("photos", nargs="+", type=Path, metavar="PHOTO", help="image file; several make a folder each")
     where = extract.add_mutually_exclusive_group(required=True)
@@ -109,6 +111,14 @@ def _parser() -> argparse.ArgumentParser:
     resample.add_argument(
         "concepts", nargs="+", type=Path, metavar="CONCEPT", help="NAME/NAME_concept.json in a palette's folder"
     )
+    fit = commands.add_parser("fit", help="leave in a palette what a scene's cameras show of it")
+    fit.add_argument("palette", type=Path, metavar="DIR", help="a palette's folder; it stays as it is")
+    fit.add_argument("--scene", type=Path, required=True, metavar="FILE", help=".blend that uses its materials")
+    extract.add_argument("--fit-scene", type=Path, metavar="FILE", help=".blend that will use them: `fit` at once")
+    for each in (extract, resample, fit):
+        each.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
+        each.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
+        each.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
     for each in (extract, resample):
         each.add_argument(
             "--decomposer", default="unet", help="unet (a network), analytic, or resnet101=FILE (%(default)s)"
@@ -118,10 +128,71 @@ def _parser() -> argparse.ArgumentParser:
         each.add_argument("--seed", type=int, default=0, metavar="N", help="another seed, another variation")
         each.add_argument("--scale", type=float, default=1.0, metavar="S", help="enlarge the texture S times (1)")
         each.add_argument("--full-maps", action="store_true", help="reduce nothing: no value, no smaller map")
-        each.add_argument("--pack", action="store_true", help="pack the textures into palette.blend")
-        each.add_argument("--overwrite", action="store_true", help="replace an earlier palette in DIR")
-        each.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
     return parser
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    from . import nodes
+    from .output import staged
+    from .palette import Palette, read_palette, write_palette
+    from .region import file_name
+
+    folder, output = arguments.palette, arguments.output
+    if output.resolve() == folder.resolve():
+        raise PaletteError(f"'{folder}' holds the full maps, which would be replaced; name another folder with -o")
+    content, materials, settings = read_palette(folder)
+    seen = _look(arguments.scene, [material.name for material in materials])
+    line = _Line(arguments.scene.name)
+    with staged(output, arguments.overwrite) as staging:
+        palette = Palette(None, content["photo"], [], settings, materials)
+        for material in materials:
+            if material.svbrdf is not None:
+                concept = folder / file_name(material.name) / f"{file_name(material.name)}_concept.json"
+                _fit_one(material, seen.get(material.name), line, concept, settings)
+        written = write_palette(palette, staging)
+        previews = {material.name: material.preview for material in materials if material.svbrdf is not None}
+        nodes.write_blend(staging / "palette.blend", written, staging, previews, pack=arguments.pack)
+    line.say(f"{len(previews)} materials written to {output}")
+    return DONE
+
+
+def _look(path: Path, names: list[str]) -> dict:
+    """What the cameras of the scene in a .blend, which is opened, see of the materials of these names."""
+    import bpy
+
+    from .scene import look
+
+    if not path.is_file():
+        raise PaletteError(f"there is no scene '{path}'")
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path.resolve()), load_ui=False, use_scripts=False)
+    except RuntimeError as error:
+        raise PaletteError(f"'{path}' can't be opened: {error}") from None
+    materials = [bpy.data.materials[name] for name in names if name in bpy.data.materials]
+    if not materials:
+        raise PaletteError(f"'{path}' has none of the materials {', '.join(names)}; append or link palette.blend there")
+    return look(bpy.context.scene, materials, _Line(path.name).progress)
+
+
+def _fit_one(material, seen, line, concept: Path | None, settings) -> None:
+    from .palette import fit_material, resample_material
+    from .reduction import largest
+
+    if seen is None or seen.why:
+        line.say(f"{material.name}: kept as it is: {seen.why if seen else 'the scene does not have it'}")
+        return
+    have = largest(material.svbrdf)
+    if seen.texels > have and have < settings.resolution and concept is not None and concept.is_file():
+        again = resample_material(concept, settings, line.progress)
+        material.svbrdf, material.reduced, material.bits = again.svbrdf, again.reduced, again.bits
+        material.metres_per_tile, have = again.metres_per_tile, largest(again.svbrdf)
+        line.say(f"{material.name}: sampled again from its concept")
+    fit_material(material, seen.texels, line.progress)
+    line.say(
+        f"{material.name}: a tile is at most {seen.texels:.0f} px long and covers {seen.share:.1%} of a picture"
+        + (f"; its {have} px are fewer" if seen.texels > have else "")
+    )
+    line.ledger(material.name, material.reduced)
 
 
 def _resample(arguments: argparse.Namespace) -> int:
@@ -219,6 +290,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
             chosen = arguments.segment, arguments.regions, settings.seed
             regions = segment(photo.pixels, *chosen, line.progress, warn, arguments.weights)
         add_geometry(regions, corners, measures, photo.scale)
+        seen = _look(arguments.fit_scene, [region.name for region in regions]) if arguments.fit_scene else {}
         seconds["regions"] = time.perf_counter() - start
 
         def on_material(material: Material) -> None:
@@ -237,6 +309,9 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         palette.scale = photo.scale
         palette.seconds = seconds | palette.seconds
         failed = [material for material in palette.materials if material.error]
+        for material in palette.materials:
+            if arguments.fit_scene and not material.error:
+                _fit_one(material, seen.get(material.name), line, None, settings)
         if len(failed) == len(regions):
             raise PaletteError("no material could be made: " + "; ".join(material.error for material in failed))
         content = write_palette(palette, staging, line.progress)

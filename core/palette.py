@@ -5,12 +5,14 @@ photo + regions -> exemplar -> concept -> texture -> SVBRDF -> reduced SVBRDF ->
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -31,6 +33,8 @@ SCALE_RANGE = (0.25, 8.0)
 LEAST_SAMPLED = 32  # px
 CONCEPT_VERSION = 1
 PREVIEW = 256  # px
+LEAST_FITTED = 16  # px
+TEXELS_PER_PIXEL = 1.0  # of a picture, where a scene is known
 EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
@@ -312,9 +316,92 @@ def _finish(material: Material, svbrdf: SVBRDF, full_maps: bool, progress: Progr
             material.svbrdf, material.reduced, material.bits = found.svbrdf, found.ledger, found.bits
             material.metres_per_tile /= found.parts
     with _timed(seconds, "preview"):
-        sphere = brdf.render_sphere(material.svbrdf, PREVIEW)
-        material.preview = np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
+        material.preview = _preview(material.svbrdf)
     progress(1.0, "done")
+
+
+def _preview(svbrdf: SVBRDF) -> np.ndarray:
+    sphere = brdf.render_sphere(svbrdf, PREVIEW)
+    return np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
+
+
+def fit_material(material: Material, texels: float, progress: Progress) -> None:
+    """Leave in a material, whose tile is shown `texels` pixels long at most, what can then be told from the whole."""
+    full = material.svbrdf
+    side = max(LEAST_FITTED, 8 * math.ceil(texels * TEXELS_PER_PIXEL / 8))
+    with _timed(material.seconds, "fit"):
+        shrunk = reduction.shrink(full, side)
+        found = reduction.reduce(shrunk, progress, parts=1)
+        before, after = (reduction.texture_bytes(reduction.maps_of(x), found.bits) for x in (full, shrunk))
+        if reduction.largest(full) > side:
+            change = {"map": "all", "change": f"{side} px are seen", "bytes": before - after, "flip": 0.0}
+            material.reduced = [*material.reduced, change]
+        # what was constant before stands in the ledger already
+        known = {(e["map"], e["change"]) for e in material.reduced}
+        material.reduced = [*material.reduced, *(e for e in found.ledger if (e["map"], e["change"]) not in known)]
+        material.svbrdf, material.bits = found.svbrdf, found.bits
+        material.preview = _preview(material.svbrdf)
+
+
+def read_palette(folder: Path) -> tuple[dict, list[Material], Settings]:
+    """What palette.json holds, its materials and settings. Raises PaletteError for a folder that holds no palette."""
+    try:
+        content = json.loads((folder / "palette.json").read_text(encoding="utf-8"))
+        if content["version"] != VERSION:
+            raise ValueError(f"version {content['version']}, this extension reads {VERSION}")
+        known = {f.name for f in dataclasses.fields(Settings)} - {"diffusion"}
+        settings = Settings(**{name: value for name, value in content["settings"].items() if name in known})
+        return content, [read_material(record, folder) for record in content["materials"]], settings
+    except OSError as error:
+        raise PaletteError(f"cannot read '{folder / 'palette.json'}': {error.strerror or error}") from error
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise PaletteError(f"'{folder}' holds no palette that can be read ({error}); extract it again") from error
+
+
+def read_material(record: dict, folder: Path) -> Material:
+    """The material of a record that `write_material` has returned, from its files below `folder`.
+
+    Raises PaletteError for a file that is missing, or that is no map.
+    """
+    material = Material(
+        record["name"],
+        record["status"],
+        reduced=list(record["reduced"]),
+        warnings=list(record["warnings"]),
+        seconds=dict(record["seconds"]),
+        error=record["error"],
+        metres_per_tile=record["metres_per_tile"],
+        rectification=record["rectification"],
+    )
+    if material.status != "ok":
+        return material
+
+    def read(kind: str) -> np.ndarray:
+        entry = record["maps"][kind]
+        if "value" in entry:
+            return np.asarray(entry["value"], np.float32)
+        pixels = cv2.imread(str(folder / entry["file"]), cv2.IMREAD_UNCHANGED)
+        if pixels is None or pixels.ndim != (2 if kind in ("roughness", "height") else 3):
+            raise PaletteError(f"'{folder / entry['file']}' is missing or no map of kind {kind}; extract it again")
+        material.bits[kind] = 8 * pixels.itemsize
+        pixels = pixels / np.float32(np.iinfo(pixels.dtype).max)
+        return pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., ::-1])
+
+    albedo, normal, roughness, height = (read(kind) for kind in ("basecolor", "normal", "roughness", "height"))
+    if normal.ndim > 1:
+        normal = normal * 2 - 1
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    relief = record["maps"]["height"]
+    material.svbrdf = SVBRDF(
+        linear_from_srgb(albedo) if albedo.ndim > 1 else albedo,
+        normal,
+        roughness if roughness.ndim else float(roughness),
+        (height - relief["midlevel"]) * relief["scale"] if height.ndim else None,
+    )
+    if record["exemplar"]:
+        picture = cv2.imread(str(folder / record["exemplar"]))
+        material.exemplar = None if picture is None else np.ascontiguousarray(picture[..., ::-1])
+    return material
 
 
 def preview_exemplar(

@@ -54,20 +54,25 @@ class Reduction:
     ledger: list[dict] = field(default_factory=list)
 
 
-def reduce(svbrdf: SVBRDF, progress: Progress = lambda fraction, message: None, visible: float = VISIBLE) -> Reduction:
-    """The least maps that look like the given ones, which are constants or square and of one size, and what they save.
+def reduce(
+    svbrdf: SVBRDF,
+    progress: Progress = lambda fraction, message: None,
+    visible: float = VISIBLE,
+    parts: int = MOST_PARTS,
+) -> Reduction:
+    """The least maps that look like the given ones, which are constants or square, and what they save.
 
-    visible: the error that may be made, FLIP in [0, 1].
+    visible: the error that may be made, FLIP in [0, 1]. parts: that the tile may be divided into, along each axis.
     """
-    full = {"basecolor": svbrdf.albedo, "normal": svbrdf.normal, "roughness": np.asarray(svbrdf.roughness, np.float32)}
+    full = maps_of(svbrdf)
     found = Reduction(svbrdf)
 
     def note(kind: str, change: str, before: Maps, after: Maps, error: float) -> None:
         saved = texture_bytes(before, found.bits) - texture_bytes(after, found.bits)
         found.ledger.append({"map": kind, "change": change, "bytes": saved, "flip": round(error, 4)})
 
-    for k in range(MOST_PARTS, 1, -1):
-        progress(0.1 * (MOST_PARTS - k) / MOST_PARTS, "looking for periods")
+    for k in range(parts, 1, -1):
+        progress(0.1 * (parts - k) / parts, "looking for periods")
         folded = _folded(full, k)
         if folded is None:
             continue
@@ -127,14 +132,24 @@ def say(ledger: list[dict]) -> list[str]:
 def shrink(svbrdf: SVBRDF, side: int) -> SVBRDF:
     """The SVBRDF with maps of at most `side` texels along each axis, as a picture that shows no more of it averages
     them: what the normals lose widens the roughness, which may become a map by it."""
-    roughness = np.asarray(svbrdf.roughness, np.float32)
-    full = {"basecolor": svbrdf.albedo, "normal": svbrdf.normal, "roughness": roughness}
-    if side >= max(map(_side, full.values())):
-        return svbrdf
-    height = svbrdf.height if svbrdf.height is None else _shrunk(svbrdf.height, min(side, len(svbrdf.height)))
-    normal, variance = _shrunk_normal(svbrdf.normal, side)
-    roughness = _wider(_shrunk(roughness, side), variance)
-    return SVBRDF(_shrunk(svbrdf.albedo, side), normal, roughness if roughness.ndim else float(roughness), height)
+
+    def at_most(value):
+        return _shrunk(value, min(side, _side(value)))
+
+    normal, variance = _shrunk_normal(svbrdf.normal, min(side, _side(svbrdf.normal)))
+    roughness = _wider(at_most(np.asarray(svbrdf.roughness, np.float32)), variance)
+    height = None if svbrdf.height is None else at_most(svbrdf.height)
+    roughness = roughness if roughness.ndim else float(roughness)
+    return SVBRDF(at_most(svbrdf.albedo), normal, roughness, height, svbrdf.metallic)
+
+
+def maps_of(svbrdf: SVBRDF) -> Maps:
+    return {"basecolor": svbrdf.albedo, "normal": svbrdf.normal, "roughness": np.asarray(svbrdf.roughness, np.float32)}
+
+
+def largest(svbrdf: SVBRDF) -> int:
+    """Side of its largest map in texels, 0 where all are constants."""
+    return max(map(_side, maps_of(svbrdf).values()))
 
 
 def _side(value: np.ndarray) -> int:
