@@ -187,7 +187,7 @@ def _fit_one(material, seen, line, concept: Path | None, settings) -> None:
         material.svbrdf, material.reduced, material.bits = again.svbrdf, again.reduced, again.bits
         material.metres_per_tile, have = again.metres_per_tile, largest(again.svbrdf)
         line.say(f"{material.name}: sampled again from its concept")
-    fit_material(material, seen.texels, line.progress)
+    fit_material(material, seen.texels, line.progress, seen.displaced)
     line.say(
         f"{material.name}: a tile is at most {seen.texels:.0f} px long and covers {seen.share:.1%} of a picture"
         + (f"; its {have} px are fewer" if seen.texels > have else "")

@@ -325,13 +325,16 @@ def _preview(svbrdf: SVBRDF) -> np.ndarray:
     return np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
 
 
-def fit_material(material: Material, texels: float, progress: Progress) -> None:
-    """Leave in a material, whose tile is shown `texels` pixels long at most, what can then be told from the whole."""
+def fit_material(material: Material, texels: float, progress: Progress, displaced: bool = False) -> None:
+    """Leave in a material, whose tile is shown `texels` pixels long at most, what can then be told from the whole.
+
+    displaced: its height is displayed, so that normals which don't show are no reason to drop it.
+    """
     full = material.svbrdf
     side = max(LEAST_FITTED, 8 * math.ceil(texels * TEXELS_PER_PIXEL / 8))
     with _timed(material.seconds, "fit"):
         shrunk = reduction.shrink(full, side)
-        found = reduction.reduce(shrunk, progress, parts=1)
+        found = reduction.Reduction(shrunk) if displaced else reduction.reduce(shrunk, progress, parts=1)
         before, after = (reduction.texture_bytes(reduction.maps_of(x), found.bits) for x in (full, shrunk))
         if reduction.largest(full) > side:
             change = {"map": "all", "change": f"{side} px are seen", "bytes": before - after, "flip": 0.0}

@@ -28,10 +28,12 @@ Progress = Callable[[float, str], None]
 @dataclass
 class Seen:
     """texels: along a tile's side that the nearest camera shows, 0 where none sees it. share: of a picture that it
-    covers, at most. why: it can't be told, and the maps have to stay; else empty."""
+    covers, at most. displaced: its relief is bump or displacement. why: it can't be told, and the maps have to stay;
+    else empty."""
 
     texels: float = 0.0
     share: float = 0.0
+    displaced: bool = False
     why: str = ""
 
 
@@ -41,7 +43,10 @@ def look(scene, materials, progress: Progress = lambda fraction, message: None) 
     All its cameras, over its frame range, at its render resolution. What is seen only in a mirror counts as not seen.
     The frame is as before afterwards. Raises PaletteError for a scene without camera.
     """
-    found = {material.name: Seen(why=_unjudged(scene, material)) for material in materials}
+    found = {}
+    for material in materials:
+        displaced = bool(Controls(material)) and Controls(material).relief != "NORMAL"
+        found[material.name] = Seen(displaced=displaced, why=_unjudged(scene, material))
     cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]
     if not cameras:
         raise PaletteError(f"scene '{scene.name}' has no camera; add one where the palette will be seen from")

@@ -11,6 +11,7 @@ from . import (
     exemplar,
     export,
     extract,
+    fit,
     history,
     palette,
     photo,
@@ -36,6 +37,7 @@ _MODULES = (
     exemplar,
     palette,
     assign,
+    fit,
     export,
     preferences,
 )

@@ -32,8 +32,8 @@ def put_in_palette(settings, key, material, keep_before=True):
     old = entry.material
     if old is not None:
         _drop_before(entry)
-        _adopt_adjustments(material, old)
-        _take_place(material, old)
+        adopt_adjustments(material, old)
+        take_place(material, old)
         if keep_before:
             entry.previous = old
         else:
@@ -42,7 +42,8 @@ def put_in_palette(settings, key, material, keep_before=True):
     return entry
 
 
-def _adopt_adjustments(material, old):
+def adopt_adjustments(material, old):
+    """What the artist has changed on `old` holds for `material`."""
     from ..core.nodes import Controls
 
     if not (Controls(old) and Controls(material)):
@@ -53,7 +54,7 @@ def _adopt_adjustments(material, old):
     Controls(material).set(values)
 
 
-def _take_place(material, old):
+def take_place(material, old):
     """`material` stands wherever `old` did, under its name."""
     name = old.name
     old.user_remap(material)
@@ -130,7 +131,7 @@ class MATERIAL_PALETTE_OT_compare(_NeedsBefore, Operator):
         asset = new.asset_data
         told = (asset.description, asset.author, asset.license) if asset else None
         entry.previous = None
-        _take_place(old, new)
+        take_place(old, new)
         entry.material, entry.previous = old, new
         if told is not None:
             nodes.mark_asset(old, *told)

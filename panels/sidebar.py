@@ -249,6 +249,7 @@ class PalettePanel:
             row.operator("material_palette.discard_before", icon="CHECKMARK")
         for warning in entry.warnings.splitlines():
             _draw_text(layout, context, warning, "INFO")
+        layout.operator("material_palette.fit_scene", icon="VIEW_CAMERA")
         row = layout.row(align=True)
         row.operator("material_palette.save_library", text="To Library", icon="ASSET_MANAGER")
         row.operator("material_palette.export", text="Export", icon="EXPORT")
