@@ -1,4 +1,4 @@
-"""Fit Palette to Scene: each material keeps the texels that the scene's cameras show; the full one is kept beside it."""
+"""Fit Palette to Scene: each material keeps the texels that the scene's cameras show, and the full one beside it."""
 
 import shutil
 import tempfile
