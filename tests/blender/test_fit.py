@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 from material_palette.core.material import SVBRDF
-from test_scene import camera, plane
+from stage import camera, plane
 
 SIDE = 256
 

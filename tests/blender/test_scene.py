@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 import pytest
+from stage import camera, plane
 
 WIDTH, HEIGHT = 400, 200
 
@@ -23,27 +24,6 @@ def scene(stone):
     plane("wall", stone, 2.0)
     camera("front", (0, 0, 5))
     return scene
-
-
-def plane(name, material, size, height=0.0):
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size / 2
-    mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata([(x, y, height) for x, y in corners], [], [(0, 1, 2, 3)])
-    mesh.uv_layers.new().data.foreach_set("uv", corners.astype(np.float32).ravel())
-    if material is not None:
-        mesh.materials.append(material)
-    obj = bpy.data.objects.new(name, mesh)
-    bpy.context.scene.collection.objects.link(obj)
-    return obj
-
-
-def camera(name, place, kind="ORTHO", scale=4.0):
-    lens = bpy.data.cameras.new(name)
-    lens.type, lens.ortho_scale = kind, scale
-    obj = bpy.data.objects.new(name, lens)
-    obj.location = place
-    bpy.context.scene.collection.objects.link(obj)
-    return obj
 
 
 def seen(scene, stone):
