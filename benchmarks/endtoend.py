@@ -154,7 +154,7 @@ def extracted(photo, mask, shown, part, quality, decomposers, view, resolution) 
     for name in decomposers:
         start, maps = time.process_time(), material.svbrdf
         if "texture" in _kept:
-            maps = reduction.reduce(decomposition.decompose(_kept["texture"], _quiet, name))[0]
+            maps = reduction.reduce(decomposition.decompose(_kept["texture"], _quiet, name)).svbrdf
         found[name] = Found(maps, density, base + time.process_time() - start, tuple(material.warnings))
     return found
 

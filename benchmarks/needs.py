@@ -1,0 +1,263 @@
+#!/usr/bin/env python3
+"""What a scene needs: textures, file, seconds and memory of full palettes and of fitted ones, and how their pictures differ.
+
+    python3 dev.py bench needs --data DATA          # about 10 minutes of one core
+    python3 dev.py bench needs --quick              # one small scene, from the bundled photo
+
+Three scenes of `scenes.py`, each with the palette of the bundled photo as it is extracted with --full-maps, and with
+materials of DATA (CC0, test split, in their own size). Each is rendered by Cycles with the full palette, with that
+which extraction leaves (FLIP at a texel per pixel), and fitted to the scene at several texels per pixel; the product's
+own functions fit, write and build it. Writes needs.csv, needs.json and the chart.
+"""
+
+import argparse
+import re
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import dev  # noqa: E402
+
+dev.load_package()
+from material_palette.benchmarks import charts, records, scenes  # noqa: E402
+from material_palette.core import palette, reduction  # noqa: E402
+from material_palette.core.flip import flip  # noqa: E402
+from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
+from material_palette.core.material import SVBRDF  # noqa: E402
+from material_palette.core.region import read_regions  # noqa: E402
+
+SIZE, SAMPLES = (960, 540), 8
+FACTORS = (0.25, 0.5, 1.0, 2.0)  # texels per pixel
+EXAMPLE = ROOT / "examples" / "viaduct"
+SHIPPED = "fitted, 1 texel per pixel"
+
+
+def quiet(fraction: float, message: str) -> None:
+    pass
+
+
+def bundled(folder: Path, resolution: int) -> list[palette.Material]:
+    """The bundled photo's palette with nothing reduced, extracted once into `folder`."""
+    if not (folder / "palette.json").exists():
+        photo = read_photo(EXAMPLE / "photo.jpg")
+        regions = read_regions(EXAMPLE / "masks", photo.pixels.shape[:2], photo.scale)
+        settings = palette.Settings(resolution=resolution, quality="draft", full_maps=True)
+        folder.mkdir(parents=True)
+        palette.write_palette(palette.extract_palette(photo.pixels, regions, settings, quiet), folder)
+    return palette.read_palette(folder)[1]
+
+
+def known(data: Path, number: int) -> list[palette.Material]:
+    """Four materials of the data folder, square, at most 1024 px."""
+    folders = sorted(p for p in (data / "pbr" / "polyhaven").iterdir() if (p / "roughness.jpg").exists())
+    order = np.random.default_rng(0).permutation(len(folders))
+    found = []
+    for i in order[4 * number : 4 * number + 4]:
+        maps = {kind: cv2.imread(str(folders[i] / f"{kind}.jpg")) for kind in reduction.KINDS}
+        side = min(min(pixels.shape[:2]) for pixels in maps.values())
+        maps = {kind: pixels[:side, :side, ::-1] / np.float32(255) for kind, pixels in maps.items()}
+        normal = maps["normal"] * 2 - 1
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+        albedo, roughness = linear_from_srgb(maps["basecolor"]), np.ascontiguousarray(maps["roughness"][..., 0])
+        found.append(palette.Material(folders[i].name, svbrdf=SVBRDF(albedo, normal, roughness)))
+    return found
+
+
+def copy_of(material: palette.Material, svbrdf: SVBRDF, bits: dict | None = None) -> palette.Material:
+    return palette.Material(
+        material.name,
+        svbrdf=svbrdf,
+        bits=bits or dict.fromkeys(reduction.KINDS, 8),
+        metres_per_tile=material.metres_per_tile,
+    )
+
+
+class Stage:
+    """A scene, its parts dressed in a palette by the product's own node trees."""
+
+    def __init__(self, kind: str, number: int, size, samples: int):
+        import bpy
+
+        self.bpy, self.samples = bpy, samples
+        self.scene = scenes.Scene(kind, number, size, samples)
+        bpy.context.scene.render.use_persistent_data = False
+        bpy.context.scene.frame_end = 1
+        self.tiles = scenes.KINDS[kind]
+        self.built = []
+
+    def dress(self, materials: list[palette.Material], folder: Path) -> None:
+        from material_palette.core import nodes
+
+        for material in self.built:
+            nodes.remove_material(material)
+        self.built = []
+        for (part, metres), material in zip(self.tiles.items(), materials, strict=True):
+            record = palette.write_material(material, folder / material.name) | {"metres_per_tile": metres}
+            self.built.append(nodes.build_material(record, folder, pack=True))
+            self.scene.things[part].data.materials.clear()
+            self.scene.things[part].data.materials.append(self.built[-1])
+        self.bpy.context.view_layer.update()
+
+    def look(self):
+        from material_palette.core.scene import look
+
+        seen = look(self.bpy.context.scene, self.built)
+        return [seen[material.name] for material in self.built]
+
+    def render(self) -> tuple[np.ndarray, float, float]:
+        """The picture, linear, the CPU seconds and Cycles' own peak memory in MB."""
+        peaks = [0.0]
+
+        def listen(*arguments):
+            text = " ".join(map(str, arguments))
+            peaks.extend(float(x) for x in re.findall(r"Peak:? ?([\d.]+) ?M", text))
+
+        self.bpy.app.handlers.render_stats.append(listen)
+        start = time.process_time()
+        picture = self.scene.render()
+        seconds = time.process_time() - start
+        self.bpy.app.handlers.render_stats.remove(listen)
+        return picture, seconds, max(peaks)
+
+    def file_bytes(self, folder: Path) -> int:
+        """Size of a .blend that holds the materials, packed."""
+        path = folder / "materials.blend"
+        self.bpy.data.libraries.write(str(path), set(self.built), fake_user=True)
+        size = path.stat().st_size
+        path.unlink()
+        return size
+
+
+def measure(kind: str, number: int, name: str, materials, options, work: Path) -> list[dict]:
+    """A row per version of the palette in one scene."""
+    stage = Stage(kind, number, options.size, options.samples)
+    full = [copy_of(material, material.svbrdf) for material in materials]
+    stage.dress(full, work / "full")
+    start = time.process_time()
+    seen = stage.look()
+    looking = time.process_time() - start
+    versions = {"full": full}
+    start = time.process_time()
+    reduced = [reduction.reduce(material.svbrdf, parts=1) for material in full]
+    reducing = time.process_time() - start
+    versions["extracted"] = [copy_of(m, r.svbrdf, r.bits) for m, r in zip(full, reduced, strict=True)]
+    for factor in options.factors:
+        fitted = [copy_of(material, material.svbrdf) for material in full]
+        for material, one in zip(fitted, seen, strict=True):
+            palette.fit_material(material, one.texels * factor / palette.TEXELS_PER_PIXEL, quiet)
+        versions[f"fitted, {factor:g} texel{'s' if factor > 1 else ''} per pixel"] = fitted
+    rows, reference, gain = [], None, 1.0
+    for version, made in versions.items():
+        stage.dress(made, work / version.replace(" ", "_"))
+        picture, seconds, peak = stage.render()
+        if reference is None:
+            luminance = picture @ np.array([0.2126, 0.7152, 0.0722])
+            gain = min(0.2 / np.exp(np.log(np.maximum(luminance, 1e-4)).mean()), 0.95 / np.percentile(luminance, 98))
+        picture = srgb_from_linear(scenes.exposed(picture, gain))
+        reference = picture if reference is None else reference
+        difference = flip(reference, picture)
+        cv2.imwrite(str(work / f"{version.replace(' ', '_')}.png"), np.rint(picture[..., ::-1] * 255))
+        rows.append(
+            {
+                "scene": kind,
+                "palette": name,
+                "version": version,
+                "texture_bytes": sum(reduction.texture_bytes(reduction.maps_of(m.svbrdf), m.bits) for m in made),
+                "blend_bytes": stage.file_bytes(work),
+                "flip": float(difference.mean()),
+                "flip_98": float(np.percentile(difference, 98)),
+                "render_seconds": seconds,
+                "render_peak_mb": peak,
+                "sides": " ".join(str(reduction.largest(m.svbrdf)) for m in made),
+                "look_seconds": looking,
+                "reduce_seconds": reducing,
+            }
+        )
+        print(rows[-1], flush=True)
+    return rows
+
+
+def chart(rows: list[dict], path: Path) -> None:
+    """FLIP against the share of the full palette's bytes, the chosen point marked."""
+    pyplot = charts.plt()
+    if pyplot is None:
+        return
+    figure, axes = pyplot.subplots(figsize=(5.4, 3.4))
+    for i, key in enumerate(dict.fromkeys((row["palette"], row["scene"]) for row in rows)):
+        own = [row for row in rows if (row["palette"], row["scene"]) == key]
+        whole = own[0]["texture_bytes"]
+        own = sorted(own[1:], key=lambda row: row["texture_bytes"])
+        x, y = [whole / row["texture_bytes"] for row in own], [row["flip"] for row in own]
+        colour = charts.COLOURS[i % len(charts.COLOURS)]
+        axes.plot(x, y, "o-", color=colour, markersize=3, linewidth=1, label=f"{key[1]}, {key[0]}")
+        chosen = [(a, b) for a, b, row in zip(x, y, own, strict=True) if row["version"] == SHIPPED]
+        axes.plot(*zip(*chosen, strict=True), "o", color=colour, markersize=9, fillstyle="none")
+    axes.axhline(0.02, color=charts.GREY, linewidth=0.8, linestyle=":")
+    axes.axvline(4, color=charts.GREY, linewidth=0.8, linestyle=":")
+    axes.set_xscale("log")
+    axes.set_xlabel("texture memory, times less than full (rings: as `fit` does it)")
+    axes.set_ylabel("mean FLIP to the full palette")
+    axes.legend(frameon=False, fontsize=7)
+    charts.save(figure, path)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder with pbr/polyhaven/; without: the bundled photo only")
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "dist" / "benchmarks" / "needs")
+    parser.add_argument("--palette", type=Path, metavar="DIR", help="a palette in place of the bundled photo's")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no scene after so long; go on later")
+    parser.add_argument("--quick", action="store_true", help="one small scene, one palette")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    options.size, options.samples = ((480, 270), 4) if options.quick else (SIZE, SAMPLES)
+    options.factors = (1.0,) if options.quick else FACTORS
+    parts = records.Parts(
+        options.output.parent / "parts" / ("needs-quick" if options.quick else "needs"), options.minutes
+    )
+    work = parts.folder / "work"
+    kinds = list(scenes.KINDS)[:1] if options.quick else list(scenes.KINDS)
+    rows = []
+    for number, kind in enumerate(kinds):
+        palettes = {"bundled": lambda: bundled(options.palette or work / "palette", 256 if options.quick else 1024)}
+        if options.data and (options.data / "pbr" / "polyhaven").is_dir() and not options.quick:
+            palettes["poly haven"] = lambda number=number: known(options.data, number)
+        for name, read in palettes.items():
+            folder = work / f"{kind} {name}"
+            folder.mkdir(parents=True, exist_ok=True)
+            done = parts.get(
+                f"{kind}-{name}",
+                lambda *a, k=kind, n=number, m=name, r=read, f=folder: measure(k, n, m, r(), options, f),
+            )
+            rows += done or []
+    if not rows:
+        return 0
+    pairs = [
+        (row, next(r for r in rows if r["scene"] == row["scene"] and r["palette"] == row["palette"])) for row in rows
+    ]
+    summary = {}
+    for version in dict.fromkeys(row["version"] for row in rows):
+        own = [(row, full) for row, full in pairs if row["version"] == version]
+        summary[version] = {
+            "times_less_texture_memory": float(np.median([f["texture_bytes"] / r["texture_bytes"] for r, f in own])),
+            "least_times": float(min(f["texture_bytes"] / r["texture_bytes"] for r, f in own)),
+            "times_smaller_file": float(np.median([f["blend_bytes"] / r["blend_bytes"] for r, f in own])),
+            "mean_flip": float(np.mean([r["flip"] for r, _ in own])),
+            "largest_flip": float(max(r["flip"] for r, _ in own)),
+            "render_seconds_ratio": float(np.median([r["render_seconds"] / f["render_seconds"] for r, f in own])),
+            "render_peak_mb_less": float(np.median([f["render_peak_mb"] - r["render_peak_mb"] for r, f in own])),
+        }
+        print(version, {k: round(v, 4) for k, v in summary[version].items()})
+    records.write(options.output, "needs", rows, {"summary": summary, "samples": options.samples}, parts)
+    chart(rows, options.output / "needs")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
