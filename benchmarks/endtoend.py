@@ -29,7 +29,7 @@ dev.load_package()
 from material_palette.benchmarks import charts, records, scenes, svbrdf  # noqa: E402
 from material_palette.benchmarks.baselines import largest_square  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
-from material_palette.core import decomposition, palette, perceptual, reduction  # noqa: E402
+from material_palette.core import decomposition, palette, perceptual  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.image import linear_from_srgb, srgb_from_linear  # noqa: E402
 from material_palette.core.material import SVBRDF  # noqa: E402
@@ -154,7 +154,7 @@ def extracted(photo, mask, shown, part, quality, decomposers, view, resolution) 
     for name in decomposers:
         start, maps = time.process_time(), material.svbrdf
         if "texture" in _kept:
-            maps = reduction.reduce(decomposition.decompose(_kept["texture"], _quiet, name)).svbrdf
+            maps = decomposition.decompose(_kept["texture"], _quiet, name)
         found[name] = Found(maps, density, base + time.process_time() - start, tuple(material.warnings))
     return found
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What a scene needs: textures, file, seconds and memory of full palettes and of fitted ones, and how their pictures differ.
+"""What a scene needs: textures, file, seconds and memory of full and of fitted palettes, and how pictures differ.
 
     python3 dev.py bench needs --data DATA          # about 10 minutes of one core
     python3 dev.py bench needs --quick              # one small scene, from the bundled photo
@@ -218,9 +218,8 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     options.size, options.samples = ((480, 270), 4) if options.quick else (SIZE, SAMPLES)
     options.factors = (1.0,) if options.quick else FACTORS
-    parts = records.Parts(
-        options.output.parent / "parts" / ("needs-quick" if options.quick else "needs"), options.minutes
-    )
+    name = "needs-quick" if options.quick else "needs"
+    parts = records.Parts(options.output.parent / "parts" / name, options.minutes)
     work = parts.folder / "work"
     kinds = list(scenes.KINDS)[:1] if options.quick else list(scenes.KINDS)
     rows = []
@@ -231,16 +230,13 @@ def main(arguments: list[str] | None = None) -> int:
         for name, read in palettes.items():
             folder = work / f"{kind} {name}"
             folder.mkdir(parents=True, exist_ok=True)
-            done = parts.get(
-                f"{kind}-{name}",
-                lambda *a, k=kind, n=number, m=name, r=read, f=folder: measure(k, n, m, r(), options, f),
-            )
-            rows += done or []
+            given = kind, number, name
+            make = lambda given=given, read=read, folder=folder: measure(*given, read(), options, folder)  # noqa: E731
+            rows += parts.get(f"{kind}-{name}", make) or []
     if not rows:
         return 0
-    pairs = [
-        (row, next(r for r in rows if r["scene"] == row["scene"] and r["palette"] == row["palette"])) for row in rows
-    ]
+    full = {(row["scene"], row["palette"]): row for row in rows if row["version"] == "full"}
+    pairs = [(row, full[row["scene"], row["palette"]]) for row in rows]
     summary = {}
     for version in dict.fromkeys(row["version"] for row in rows):
         own = [(row, full) for row, full in pairs if row["version"] == version]
