@@ -7,12 +7,14 @@
 Three scenes of `scenes.py`, each with the palette of the bundled photo as it is extracted with --full-maps, and with
 materials of DATA (CC0, test split, in their own size). Each is rendered by Cycles with the full palette, with that
 which extraction leaves (FLIP at a texel per pixel), and fitted to the scene at several texels per pixel; the product's
-own functions fit, write and build it. Writes needs.csv, needs.json and the chart.
+own functions fit, write and build it. The picture has Full HD, of which a part is rendered; it is lit by three suns,
+without bounces, so that pictures differ by their textures and not by noise. Writes needs.csv, needs.json and the chart.
 """
 
 import argparse
 import re
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -32,10 +34,12 @@ from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_
 from material_palette.core.material import SVBRDF  # noqa: E402
 from material_palette.core.region import read_regions  # noqa: E402
 
-SIZE, SAMPLES = (960, 540), 8
-FACTORS = (0.25, 0.5, 1.0, 2.0)  # texels per pixel
+SIZE, SAMPLES = (1920, 1080), 16
+BORDER = (0.3, 0.65, 0.25, 0.6)  # from left to right and from below, of the picture
+SUNS = (((0.6, 0.2, 0.4), 2.5), ((0.9, 0.0, -0.9), 1.2), ((0.3, -0.9, 0.0), 0.8))  # rotation, strength
+FACTORS = (0.5, 0.75, 1.0)  # texels per pixel
 EXAMPLE = ROOT / "examples" / "viaduct"
-SHIPPED = "fitted, 1 texel per pixel"
+SHIPPED = f"fitted, {palette.TEXELS_PER_PIXEL:g} texel per pixel"
 
 
 def quiet(fraction: float, message: str) -> None:
@@ -86,8 +90,23 @@ class Stage:
 
         self.bpy, self.samples = bpy, samples
         self.scene = scenes.Scene(kind, number, size, samples)
-        bpy.context.scene.render.use_persistent_data = False
-        bpy.context.scene.frame_end = 1
+        scene = bpy.context.scene
+        scene.render.use_persistent_data, scene.frame_end = False, 1
+        for obj in [obj for obj in scene.objects if obj.type == "LIGHT"]:
+            bpy.data.objects.remove(obj)
+        scene.world = None
+        for i, (rotation, strength) in enumerate(SUNS):
+            lamp = bpy.data.lights.new(f"sun {i}", "SUN")
+            lamp.energy, lamp.angle = strength, 0
+            obj = bpy.data.objects.new(lamp.name, lamp)
+            obj.rotation_euler = rotation
+            scene.collection.objects.link(obj)
+        scene.cycles.max_bounces = 0
+        scene.cycles.use_denoising = False
+        scene.cycles.samples = samples
+        render = scene.render
+        render.use_border = render.use_crop_to_border = True
+        render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = BORDER
         self.tiles = scenes.KINDS[kind]
         self.built = []
 
@@ -120,8 +139,11 @@ class Stage:
 
         self.bpy.app.handlers.render_stats.append(listen)
         start = time.process_time()
-        picture = self.scene.render()
-        seconds = time.process_time() - start
+        with tempfile.TemporaryDirectory() as folder:
+            self.bpy.context.scene.render.filepath = str(Path(folder) / "render.exr")
+            self.bpy.ops.render.render(write_still=True)
+            seconds = time.process_time() - start
+            picture = scenes._read(self.bpy.context.scene.render.filepath)[0]
         self.bpy.app.handlers.render_stats.remove(listen)
         return picture, seconds, max(peaks)
 
@@ -151,7 +173,7 @@ def measure(kind: str, number: int, name: str, materials, options, work: Path) -
         fitted = [copy_of(material, material.svbrdf) for material in full]
         for material, one in zip(fitted, seen, strict=True):
             palette.fit_material(material, one.texels * factor / palette.TEXELS_PER_PIXEL, quiet)
-        versions[f"fitted, {factor:g} texel{'s' if factor > 1 else ''} per pixel"] = fitted
+        versions[f"fitted, {factor:g} texel per pixel"] = fitted
     rows, reference, gain = [], None, 1.0
     for version, made in versions.items():
         stage.dress(made, work / version.replace(" ", "_"))
@@ -216,8 +238,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="one small scene, one palette")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    options.size, options.samples = ((480, 270), 4) if options.quick else (SIZE, SAMPLES)
-    options.factors = (1.0,) if options.quick else FACTORS
+    options.size, options.samples = ((960, 540), 8) if options.quick else (SIZE, SAMPLES)
+    options.factors = (palette.TEXELS_PER_PIXEL,) if options.quick else FACTORS
     name = "needs-quick" if options.quick else "needs"
     parts = records.Parts(options.output.parent / "parts" / name, options.minutes)
     work = parts.folder / "work"
