@@ -7,8 +7,8 @@
 Three scenes of `scenes.py`, each with the palette of the bundled photo as it is extracted with --full-maps, and with
 materials of DATA (CC0, test split, in their own size). Each is rendered by Cycles with the full palette, with that
 which extraction leaves (FLIP at a texel per pixel), and fitted to the scene at several texels per pixel; the product's
-own functions fit, write and build it. The picture has Full HD, of which a part is rendered; it is lit by three suns,
-without bounces, so that pictures differ by their textures and not by noise. Writes needs.csv, needs.json and the chart.
+own functions fit, write and build it. They are lit by three suns, without bounces, so that pictures differ by their
+textures and not by noise. Writes needs.csv, needs.json and the chart.
 """
 
 import argparse
@@ -34,10 +34,9 @@ from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_
 from material_palette.core.material import SVBRDF  # noqa: E402
 from material_palette.core.region import read_regions  # noqa: E402
 
-SIZE, SAMPLES = (1920, 1080), 16
-BORDER = (0.3, 0.65, 0.25, 0.6)  # from left to right and from below, of the picture
+SIZE, SAMPLES = (960, 540), 16
 SUNS = (((0.6, 0.2, 0.4), 2.5), ((0.9, 0.0, -0.9), 1.2), ((0.3, -0.9, 0.0), 0.8))  # rotation, strength
-FACTORS = (0.5, 0.75, 1.0)  # texels per pixel
+FACTORS = (1.0, 2.0)  # texels per pixel
 EXAMPLE = ROOT / "examples" / "viaduct"
 SHIPPED = f"fitted, {palette.TEXELS_PER_PIXEL:g} texel per pixel"
 
@@ -104,9 +103,6 @@ class Stage:
         scene.cycles.max_bounces = 0
         scene.cycles.use_denoising = False
         scene.cycles.samples = samples
-        render = scene.render
-        render.use_border = render.use_crop_to_border = True
-        render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = BORDER
         self.tiles = scenes.KINDS[kind]
         self.built = []
 
@@ -238,7 +234,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="one small scene, one palette")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    options.size, options.samples = ((960, 540), 8) if options.quick else (SIZE, SAMPLES)
+    options.size, options.samples = ((480, 270), 8) if options.quick else (SIZE, SAMPLES)
     options.factors = (palette.TEXELS_PER_PIXEL,) if options.quick else FACTORS
     name = "needs-quick" if options.quick else "needs"
     parts = records.Parts(options.output.parent / "parts" / name, options.minutes)

@@ -90,6 +90,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME:X,Y*2=M",
         help="metres between two photo px on a region's surface: 'floor:10,20 90,20=0.6'",
     )
+    extract.add_argument(
+        "--merge-alike",
+        nargs="?",
+        type=float,
+        const=-1.0,
+        metavar="D",
+        help="one material of regions that are at most D apart in texture and colour (0.2)",
+    )
+    extract.add_argument(
+        "--target-error", type=float, metavar="E", help="the cheapest quality predicted to meet it, by region (0.1)"
+    )
     extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
     extract.add_argument("--white-balance", default="off", help="off, or region: the region is grey on average (off)")
     diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)")
@@ -262,6 +273,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         metres_per_tile=arguments.metres_per_tile,
         diffusion=_diffusion(arguments) if arguments.engine == "diffusion" else None,
         keep_concepts=arguments.keep_concepts,
+        target_error=arguments.target_error,
     )
     settings.check()
     corners = dict(parse_corners(text) for text in arguments.corners)
@@ -290,6 +302,8 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
             chosen = arguments.segment, arguments.regions, settings.seed
             regions = segment(photo.pixels, *chosen, line.progress, warn, arguments.weights)
         add_geometry(regions, corners, measures, photo.scale)
+        if arguments.merge_alike is not None:
+            regions = _merged(photo, regions, arguments.merge_alike, line)
         seen = _look(arguments.fit_scene, [region.name for region in regions]) if arguments.fit_scene else {}
         seconds["regions"] = time.perf_counter() - start
 
@@ -298,6 +312,9 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
                 line.say(f"{material.name}: FAILED: {material.error}")
             else:
                 line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
+                if material.target is not None:
+                    said = ", ".join(f"{key} {value}" for key, value in material.target.items())
+                    line.say(f"{material.name}: error {said}")
                 line.ledger(material.name, material.reduced)
                 for warning in material.warnings:
                     line.say(f"{material.name}: warning: {warning}")
@@ -319,6 +336,21 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
     line.say(f"{len(regions) - len(failed)} of {len(regions)} materials written to {folder}")
     return SOME_FAILED if failed else DONE
+
+
+def _merged(photo, regions: list, most: float, line) -> list:
+    """The regions of which those that are one material are merged; what was done goes into the photo's warnings."""
+    from . import merging
+
+    most = merging.MOST if most < 0 else most
+    groups, distances = merging.find_alike(photo.pixels, regions, most)
+    for (i, j), apart in sorted(distances.items(), key=lambda item: item[1]):
+        names = f"{regions[i].name} and {regions[j].name}"
+        if any(i in group and j in group for group in groups):
+            photo.warnings.append(f"{names} are one material: {apart:.2f} apart, at most {most:g}")
+            line.say(photo.warnings[-1])
+    line.say(f"{len(groups)} materials of {len(regions)} regions")
+    return merging.merge(regions, groups)
 
 
 def _diffusion(arguments: argparse.Namespace):

@@ -16,12 +16,13 @@ import cv2
 import numpy as np
 import torch
 
-from . import brdf, decomposition, engines, rectification, reduction, sheet
+from . import brdf, decomposition, engines, front, rectification, reduction, sheet
 from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
 from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
+from .perceptual import Crops
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
 from .tensors import read_tensors, write_tensors
 from .torus import resize
@@ -34,7 +35,7 @@ LEAST_SAMPLED = 32  # px
 CONCEPT_VERSION = 1
 PREVIEW = 256  # px
 LEAST_FITTED = 16  # px
-TEXELS_PER_PIXEL = 1.0  # of a picture, where a scene is known
+TEXELS_PER_PIXEL = 2.0  # of a picture, where a scene is known: renderers blur between texels
 EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
@@ -49,8 +50,9 @@ class Settings:
     the plane that is found, "quad" by its corners only, "off" never; flatten takes slow changes of light and cast
     shadows out of a region; white_balance "region" takes the region's mean for grey. scale is how much larger the
     texture is shown than the photo shows it; the tile's area shrinks by as much. keep_concepts: each material's concept
-    is kept and written, to sample others from. full_maps: nothing is reduced. diffusion: settings of the engine
-    of that name.
+    is kept and written, to sample others from. full_maps: nothing is reduced. target_error:
+    each region's quality is the cheapest predicted to meet it (core/front.py), not `quality`. diffusion: settings of
+    the engine of that name.
     """
 
     engine: str = "patch"
@@ -66,6 +68,7 @@ class Settings:
     scale: float = 1.0
     keep_concepts: bool = False
     full_maps: bool = False
+    target_error: float | None = None
 
     def check(self) -> None:
         """Raise PaletteError naming the first setting that cannot be honoured."""
@@ -85,6 +88,10 @@ class Settings:
             raise PaletteError(
                 f"white balance '{self.white_balance}' is unknown; choose one of: {', '.join(WHITE_BALANCES)}"
             )
+        if self.target_error is not None:
+            front.check(self.target_error)
+            if self.engine != "patch":
+                raise PaletteError(f"a target error can be met by engine 'patch' only, not by '{self.engine}'")
         if not (0 < self.metres_per_tile < float("inf")):
             raise PaletteError(f"metres per tile is {self.metres_per_tile}; choose a positive length")
         if self.engine == "diffusion":
@@ -131,6 +138,7 @@ class Material:
     exemplar: np.ndarray | None = None
     texture: np.ndarray | None = None
     preview: np.ndarray | None = None
+    target: dict | None = None  # the error asked for, the preset chosen, the error predicted and the one found
     concept: tuple[dict[str, np.ndarray], dict] | None = None  # as engines save it; None: not asked for, or a constant
 
 
@@ -257,9 +265,32 @@ def extract_material(
                 "rectification": material.rectification,
             }
             material.concept = tensors, facts
-        svbrdf = _sample(material, engine, concept, settings, progress, learnt)
+        judge = None
+        if settings.target_error is not None:
+            settings, judge = _cheapest(material, encoded, exemplar.mask, settings)
+        svbrdf = _sample(material, engine, concept, settings, progress, learnt, judge)
     _finish(material, svbrdf, settings.full_maps, progress)
     return material
+
+
+def _cheapest(material: Material, encoded: np.ndarray, mask: np.ndarray, settings: Settings):
+    """Settings of the cheapest quality predicted to meet the error asked, and what judges its texture; both go into
+    the material's record."""
+    with _timed(material.seconds, "target"):
+        quality, predicted, meets = front.choose(front.spread(encoded, mask), settings.target_error)
+    material.target = {"asked": settings.target_error, "quality": quality, "predicted": round(predicted, 4)}
+    if not meets:
+        material.warnings.append(
+            f"no quality is predicted to meet the error {settings.target_error:g} asked of this region; "
+            f"'{quality}' comes nearest, {predicted:.3f}"
+        )
+
+    def judge(pixels: np.ndarray) -> None:
+        crops = Crops(encoded, mask)
+        found = crops.distance(pixels) if crops.found and min(pixels.shape[:2]) >= Crops.SIDE else None
+        material.target["found"] = None if found is None else round(found, 4)
+
+    return dataclasses.replace(settings, quality=quality), judge
 
 
 def resample_material(path: Path, settings: Settings, progress: Progress) -> Material:
@@ -294,12 +325,14 @@ def resample_material(path: Path, settings: Settings, progress: Progress) -> Mat
     return material
 
 
-def _sample(material: Material, engine, concept, settings: Settings, progress: Progress, start: float) -> SVBRDF:
+def _sample(material: Material, engine, concept, settings, progress: Progress, start: float, judge=None) -> SVBRDF:
     with _timed(material.seconds, "sample"):
         size = settings.sampled, settings.sampled
         texture = engine.sample(concept, size, settings.seed, _part(progress, start, 0.86), settings.quality)
         material.warnings += getattr(texture, "warnings", [])
         pixels = texture.pixels
+        if judge is not None:
+            judge(pixels)
         if settings.sampled != settings.resolution:
             pixels = np.clip(resize(pixels, (settings.resolution, settings.resolution)), 0, 1)
         material.texture = sheet.thumbnail(np.tile(pixels, (2, 2, 1)))
@@ -452,6 +485,8 @@ def write_material(material: Material, folder: Path) -> dict:
         "warnings": material.warnings,
         "error": material.error,
     }
+    if material.target is not None:
+        record["target"] = material.target
     if material.exemplar is not None:
         record["exemplar"] = f"{EXEMPLARS}/{name}.png"
         (folder.parent / EXEMPLARS).mkdir(parents=True, exist_ok=True)

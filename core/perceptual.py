@@ -106,6 +106,12 @@ class Crops:
         own = _flat(_crops(texture, corners, self.SIDE))
         return float(sum(torch.cdist(a, b).square() for a, b in zip(own, self._layers, strict=True)).min(1)[0].mean())
 
+    @torch.no_grad()
+    def apart(self, other: "Crops") -> float:
+        """Mean over these crops of the distance to the nearest of the other's."""
+        pairs = zip(self._layers, other._layers, strict=True)
+        return float(sum(torch.cdist(a, b).square() for a, b in pairs).min(1)[0].mean())
+
 
 def _crops(pixels: np.ndarray, corners: np.ndarray, side: int) -> torch.Tensor:
     h, w = pixels.shape[:2]

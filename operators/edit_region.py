@@ -133,6 +133,56 @@ class MATERIAL_PALETTE_OT_merge_region(_Edits, Operator):
         settings.active_region = next(i for i, r in enumerate(settings.regions) if r.key == key)
 
 
+class MATERIAL_PALETTE_OT_merge_alike(NeedsPackages, NeedsRegion, Operator):
+    """Merge the enabled regions that show one material, judged by texture and colour"""
+
+    bl_idname = "material_palette.merge_alike"
+    bl_label = "Merge Alike Regions"
+    bl_options = {"REGISTER", "UNDO"}
+
+    most: FloatProperty(
+        name="Farthest",
+        description="How different regions of one material may be; 0.2 joined 9 of 10 halves of one texture",
+        default=0.2,
+        min=0.0,
+        soft_max=0.5,
+    )
+
+    def execute(self, context):
+        from ..core import merging
+        from ..core.region import Region
+        from .extract import nearest
+        from .photo import photo_reader
+
+        settings = context.scene.material_palette
+        enabled = [region for region in settings.regions if region.enabled]
+        try:
+            pixels, _ = photo_reader(settings.photo)()
+            masks = {region.key: read_mask_image(region) for region in enabled}
+        except PaletteError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        seen = [Region(region.name, nearest(masks[region.key], pixels.shape[:2])) for region in enabled]
+        keys = [region.key for region in enabled]
+        groups, distances = merging.find_alike(pixels, seen, self.most)
+        said = []
+        for group in groups:
+            first = max(group, key=lambda i: int(masks[keys[i]].sum()))
+            others = [i for i in group if i != first]
+            if not others:
+                continue
+            mask = masks[keys[first]]
+            for i in others:
+                mask = mask | masks[keys[i]]
+                apart = distances[min(i, first), max(i, first)]
+                said.append(f"'{seen[i].name}' into '{seen[first].name}' ({apart:.2f} apart)")
+                remove_region(settings, next(n for n, r in enumerate(settings.regions) if r.key == keys[i]))
+            set_mask(next(r for r in settings.regions if r.key == keys[first]), mask)
+        nearest_pair = f"; the nearest are {min(distances.values()):.2f} apart" if distances else ""
+        self.report({"INFO"}, "Merged " + ", ".join(said) if said else f"No two regions are alike{nearest_pair}")
+        return {"FINISHED"} if said else {"CANCELLED"}
+
+
 class MATERIAL_PALETTE_MT_region(bpy.types.Menu):
     bl_label = "Edit Region"
     bl_description = "More edits of the regions"
@@ -145,6 +195,7 @@ class MATERIAL_PALETTE_MT_region(bpy.types.Menu):
         layout.separator()
         layout.operator("material_palette.split_region", icon="MOD_EXPLODE")
         layout.operator("material_palette.merge_region", text="Merge Another Region", icon="AUTOMERGE_ON")
+        layout.operator("material_palette.merge_alike", icon="STICKY_UVS_LOC")
         layout.separator()
         layout.operator("material_palette.import_masks", icon="IMPORT")
         layout.operator("material_palette.export_masks", icon="EXPORT")
@@ -157,5 +208,6 @@ CLASSES = (
     MATERIAL_PALETTE_OT_smooth_region,
     MATERIAL_PALETTE_OT_split_region,
     MATERIAL_PALETTE_OT_merge_region,
+    MATERIAL_PALETTE_OT_merge_alike,
     MATERIAL_PALETTE_MT_region,
 )

@@ -33,12 +33,12 @@ def made(tmp_path):
 
 
 def dress(made, pack=True):
-    """A wall of stone of 2 x 2 m, 200 px in the picture; nothing has the grain."""
+    """A wall of stone of 2 x 2 m, 100 px in the picture; nothing has the grain."""
     from material_palette.core.nodes import build_material
 
     folder, content = made
     scene = bpy.context.scene
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 400, 200, 100
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 200, 100, 100
     scene.frame_end = 1
     materials = [build_material(record, folder, pack=pack) for record in content["materials"]]
     plane("wall", materials[0], 2.0)
@@ -64,7 +64,7 @@ def side(material, kind="Palette Base Color"):
 def test_seen_materials_get_what_the_camera_shows_and_unseen_ones_the_least(palette):
     assert bpy.ops.material_palette.fit_scene() == {"FINISHED"}
     stone, grain = (entry.material for entry in palette)
-    assert 16 < side(stone) <= 104 and side(grain) <= 16  # a metre is 100 px
+    assert 16 < side(stone) <= 104 and side(grain) <= 16  # a metre is 50 px, and a px two texels
     assert [stone.name, grain.name] == ["stone", "grain"]
     assert bpy.data.objects["wall"].data.materials[0] == stone
     assert all(image.packed_file for image in bpy.data.images if image.users)
@@ -122,7 +122,7 @@ def test_the_command_line_fits_into_another_folder(made, tmp_path, capsys):
     before = {p: p.read_bytes() for p in made[0].rglob("*") if p.is_file()}
     assert main([*arguments, str(tmp_path / "small")]) == 0
     said = capsys.readouterr().out
-    assert "stone: a tile is at most 100 px long" in said and "MB" in said
+    assert "stone: a tile is at most 50 px long" in said and "MB" in said
     assert before == {p: p.read_bytes() for p in made[0].rglob("*") if p.is_file()}
     content = json.loads((tmp_path / "small" / "palette.json").read_text(encoding="utf-8"))
     stone, grain = content["materials"]

@@ -145,6 +145,15 @@ def test_removing_a_region_removes_its_mask(ready, data_blocks):
     assert data_blocks() == before
 
 
+def test_regions_that_are_alike_are_merged_and_others_are_not(ready):
+    from material_palette.operators.regions import read_mask_image
+
+    both = [read_mask_image(region) for region in ready.regions]
+    assert bpy.ops.material_palette.merge_alike() == {"CANCELLED"} and len(ready.regions) == 2
+    assert bpy.ops.material_palette.merge_alike(most=100.0) == {"FINISHED"}
+    assert len(ready.regions) == 1 and (read_mask_image(ready.regions[0]) == (both[0] | both[1])).all()
+
+
 def test_region_names_stay_apart(ready):
     for _ in range(3):
         bpy.ops.material_palette.add_region()
