@@ -26,9 +26,10 @@ def plt():
 
 def save(figure, path: Path) -> None:
     """path.svg and path.png, the same bytes for the same figure."""
-    figure.tight_layout()
+    if figure.get_layout_engine() is None:
+        figure.tight_layout()
     figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
-    figure.savefig(path.with_suffix(".png"), dpi=110)
+    figure.savefig(path.with_suffix(".png"), dpi=110, metadata={"Software": None})
     print(f"chart: {path.with_suffix('.png').name}")
 
 

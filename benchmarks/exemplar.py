@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
-from material_palette.benchmarks import lighting, measures  # noqa: E402
+from material_palette.benchmarks import charts, lighting, measures  # noqa: E402
 from material_palette.benchmarks.records import commit, machine  # noqa: E402
 from material_palette.core import rectification  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
@@ -312,12 +312,9 @@ def summarise(rows: list[dict]) -> dict:
 
 def write_chart(summary: dict, folder: Path) -> None:
     """A row of panels per family: each measure's median against the severity, per kind of texture, before and after."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    matplotlib.rcParams.update({"svg.hashsalt": "exemplar", "svg.fonttype": "none", "font.size": 8})
-    import matplotlib.pyplot as plt
-
+    plt = charts.plt()
+    if plt is None:
+        return
     names = [name for name in FAMILIES if name in summary]
     across = max(len(FAMILIES[name].charted) for name in names)
     figure, axes = plt.subplots(len(names), across, figsize=(3.4 * across, 2.7 * len(names)), squeeze=False)
@@ -342,9 +339,7 @@ def write_chart(summary: dict, folder: Path) -> None:
             place.grid(lw=0.3, alpha=0.5)
             if place.lines:
                 place.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(folder / "exemplar.svg", metadata={"Date": None})
-    figure.savefig(folder / "exemplar.png", dpi=110, metadata={"Software": None})
+    charts.save(figure, folder / "exemplar")
 
 
 def main(arguments: list[str] | None = None) -> int:

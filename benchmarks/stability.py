@@ -38,6 +38,7 @@ from material_palette.core.region import Region  # noqa: E402
 from material_palette.core.torus import resize  # noqa: E402
 
 SIDE, TILE, RESOLUTION = 320, 160, 192  # px: of photos, of a material's tile in them, of extracted maps
+FOCAL = 1.1 * SIDE  # px; known, as from EXIF
 FAMILIES: dict[str, tuple[str, tuple[float, ...]]] = {  # what the severity is; from harmless on
     "uniform": ("contrast left", (1, 0.5, 0.2, 0.1, 0.05, 0)),
     "shaded": ("lit to shaded, hard", (1, 1.5, 2, 4, 8)),
@@ -111,7 +112,7 @@ def disturbed(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: i
         c, s = np.cos(np.radians(severity)), np.sin(np.radians(severity))
         normal = np.array([s * np.cos(tilt), s * np.sin(tilt), c])
         flat = lit(maps, 2 * TILE, 2 * TILE, random)
-        photo, mask = photograph(flat * exposure, normal, 1.1 * side, (side, side), 2.0, 0.0, random)
+        photo, mask = photograph(flat * exposure, normal, FOCAL, (side, side), 2.0, 0.0, random)
         photo = photo / exposure
     elif family in ("small", "thin"):
         half = severity / 2
@@ -158,9 +159,9 @@ def quantiles(albedo: np.ndarray) -> list:
     return measures.patch_quantiles(srgb_from_linear(np.clip(albedo * gain, 0, 1)))
 
 
-def judged(albedo: np.ndarray, truth: SVBRDF, target: list) -> dict:
+def judged(albedo: np.ndarray, truth: np.ndarray, target: list) -> dict:
     """error: SWD of patches x 1000; colour: CIEDE2000 of the mean, both at one brightness."""
-    means = [np.asarray(x, np.float32).reshape(-1, 3).mean(0) for x in (truth.albedo, albedo)]
+    means = [np.asarray(x, np.float32).reshape(-1, 3).mean(0) for x in (truth, albedo)]
     lab = [svbrdf.cielab((m * 0.18 / max(float(m @ LUMINANCE), 1e-4)).reshape(1, 1, 3))[0, 0] for m in means]
     error = 1000 * measures.sliced_wasserstein(quantiles(albedo), target)
     return {"error": error, "colour": float(svbrdf.ciede2000(*lab))}
@@ -173,26 +174,24 @@ def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: in
     true = enlarged(maps.albedo, tile, tile)
     if family == "uniform":
         true = true.mean((0, 1)) + severity * (true - true.mean((0, 1)))
-    truth = SVBRDF(true, maps.normal, maps.roughness)
     target = quantiles(true)
     settings = palette.Settings(quality="draft", resolution=RESOLUTION, seed=seed)
     rows, shown = [], [srgb_from_linear(np.where(mask[..., None], photo, photo * 0.15))]
     start = time.process_time()
     row = {"method": METHODS[0], "refused": False, "warned": False, "warnings": ""}
     try:
-        material = palette.extract_material(photo, Region("region", mask), settings, lambda fraction, message: None)
+        region = Region("region", mask)
+        material = palette.extract_material(photo, region, settings, lambda fraction, message: None, focal=FOCAL)
         warnings = [w for w in material.warnings if family == "slanted" or not w.startswith(SLANT)]
-        row |= judged(material.svbrdf.albedo, truth, target)
+        row |= judged(material.svbrdf.albedo, true, target)
         row |= {"warned": bool(warnings), "warnings": "; ".join(re.sub(r"\d+", "#", w) for w in material.warnings)}
-        row["tilt"] = abs(endtoend.tilt(material.svbrdf) - endtoend.tilt(truth))
-        row["roughness"] = float(abs(np.mean(material.svbrdf.roughness) - np.mean(maps.roughness)))
         shown.append(srgb_from_linear(np.clip(material.svbrdf.albedo, 0, 1)))
     except PaletteError as error:
         row |= {"refused": True, "warned": True, "warnings": re.sub(r"\d+", "#", str(error))}
         shown.append(np.zeros((8, 8, 3), np.float32))
     rows.append(row | {"cpu_seconds": time.process_time() - start})
     crop = linear_from_srgb(cross_fade(srgb_from_linear(photo), mask, 0, 0)[0])
-    rows.append({"method": METHODS[1], "refused": False, "warned": False} | judged(crop, truth, target))
+    rows.append({"method": METHODS[1], "refused": False, "warned": False} | judged(crop, true, target))
     shown += [srgb_from_linear(crop), srgb_from_linear(np.clip(true, 0, 1))]
     if picture is not None:
         picture.parent.mkdir(parents=True, exist_ok=True)

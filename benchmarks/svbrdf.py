@@ -15,8 +15,6 @@ Matplotlib makes the chart, `flip-evaluator` the column FLIP; without them both 
 import argparse
 import csv
 import json
-import os
-import platform
 import resource
 import subprocess
 import sys
@@ -37,6 +35,8 @@ if "material_palette" not in sys.modules:
     import dev
 
     dev.load_package()
+from material_palette.benchmarks import charts  # noqa: E402
+from material_palette.benchmarks.records import command, commit, machine  # noqa: E402
 from material_palette.core import brdf, decomposition  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.exemplar import LUMINANCE  # noqa: E402
@@ -415,11 +415,9 @@ def print_cost(row: str, size: int, held_out: list[Path]) -> None:
 
 
 def chart(summary: dict, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = charts.plt()
+    if plt is None:
+        return
     panels = {
         "A_mse": ("albedo, MSE x 10 (less is better)", 10),
         "angle": ("normals, degrees (less)", 1),
@@ -437,8 +435,7 @@ def chart(summary: dict, path: Path) -> None:
         axis.tick_params(labelsize=8)
     axes[0].set_yticks(range(len(summary)), list(summary))
     axes[0].invert_yaxis()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    charts.save(figure, path)
 
 
 def sheet(materials: list[Material], decompose: Decompose, path: Path) -> None:
@@ -483,9 +480,8 @@ def main(arguments: list[str] | None = None) -> int:
     start = time.time()
     prior = fit_prior(training, size)
     rows = {row: decomposer(row, prior) for row in options.rows}
-    for module, what in (("flip_evaluator", "the column FLIP"), ("matplotlib", "the chart")):
-        if find_spec(module) is None:
-            print(f"{module} is not installed: without {what}", flush=True)
+    if find_spec("flip_evaluator") is None:
+        print("flip-evaluator is not installed: without the column FLIP", flush=True)
     print(f"{len(held_out)} held-out materials, prior of {len(training)}: {prior}", flush=True)
 
     results = []
@@ -508,17 +504,15 @@ def main(arguments: list[str] | None = None) -> int:
         writer = csv.DictWriter(file, ["row", "material", "seed", *MAPS, *OTHERS])
         writer.writeheader()
         writer.writerows(results)
-    commit = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
     about = {
         "rows": [row.partition("=")[0] for row in options.rows],
         "against": options.against,
         "size": size,
         "seeds": seeds,
         "materials": [f"{f.parent.name}/{f.name}" for f in held_out],
-        "commit": commit.stdout.strip(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "cores": os.cpu_count(),
+        "command": command(),
+        "commit": commit(),
+        "machine": machine(),
         "prior": {"albedo": prior.albedo.tolist(), "roughness": prior.roughness, "strength": prior.strength},
         "cost": cost,
         "summary": summaries,
@@ -526,8 +520,7 @@ def main(arguments: list[str] | None = None) -> int:
     (options.output / "svbrdf.json").write_text(json.dumps(about, indent=1))
     for name, summary in summaries.items():
         print(f"\n{name}\n{table(summary, options.against, cost)}")
-    if find_spec("matplotlib"):
-        chart(summaries["all"], options.output / "svbrdf.png")
+    chart(summaries["all"], options.output / "svbrdf")
     shown = [f for f in held_out if f.parent.name in ("polyhaven", "ambientcg")][:: max(1, len(held_out) // 6)][:6]
     last = rows[options.rows[-1]]
     sheet([read_material(f, size) for f in shown or held_out[:4]], last, options.output / "svbrdf.jpg")

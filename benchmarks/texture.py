@@ -31,7 +31,7 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
-from material_palette.benchmarks import baselines, measures  # noqa: E402
+from material_palette.benchmarks import baselines, charts, measures  # noqa: E402
 from material_palette.benchmarks.records import commit, machine  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402
@@ -339,13 +339,9 @@ def markdown(summary: dict) -> str:
 
 
 def write_chart(summary: dict, folder: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    # the same run gives the same file
-    matplotlib.rcParams.update({"svg.hashsalt": "texture", "svg.fonttype": "none", "font.size": 9})
-    import matplotlib.pyplot as plt
-
+    plt = charts.plt()
+    if plt is None:
+        return
     points = {e: (s["cpu_seconds"][1], s["swd"][1] * 1000) for e, s in summary.items()}
     everywhere = max(s["exemplars"] for s in summary.values())
     front = measures.pareto({e: p for e, p in points.items() if summary[e]["exemplars"] == everywhere})
@@ -367,8 +363,7 @@ def write_chart(summary: dict, folder: Path) -> None:
     axes.set_ylabel("sliced Wasserstein distance of patches x 1000")
     axes.set_title("Median and quartiles; hollow: fewer exemplars; line: Pareto front", fontsize=9)
     axes.grid(True, which="both", lw=0.3, alpha=0.5)
-    figure.savefig(folder / "texture.svg", metadata={"Date": None})
-    figure.savefig(folder / "texture.png", dpi=110, metadata={"Software": None})
+    charts.save(figure, folder / "texture")
 
 
 def write_sheet(textures: dict, exemplars: list[Exemplar], engines: list[str], folder: Path, side: int = 192) -> None:

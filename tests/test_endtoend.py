@@ -80,10 +80,10 @@ def test_the_first_severity_is_harmless_and_the_last_is_not(family):
 
 
 def test_brightness_is_no_error_but_structure_is():
-    truth = surface(0)
-    target = stability.quantiles(truth.albedo)
-    darker = stability.judged(truth.albedo * 0.5, truth, target)
-    flat = stability.judged(truth.albedo.mean((0, 1)), truth, target)
+    truth = surface(0).albedo
+    target = stability.quantiles(truth)
+    darker = stability.judged(truth * 0.5, truth, target)
+    flat = stability.judged(truth.mean((0, 1)), truth, target)
     assert darker["error"] < 1 < flat["error"]
     assert darker["colour"] < 0.01
 
