@@ -64,6 +64,33 @@ def test_packages_of_the_engine_diffusion_are_added_when_they_are_wanted(clone, 
     assert added() == 1 and len(clone.made) == 1
 
 
+def test_packages_of_the_benchmarks_are_added_once_those_without_dependencies_by_themselves(clone, monkeypatch):
+    text = (Path(dev.__file__).parent / "requirements-benchmarks.txt").read_text()
+    (clone.root / "requirements-benchmarks.txt").write_text(text)
+    asked = []
+    monkeypatch.setattr(dev, "pip", lambda arguments: asked.append(arguments) or (0, []))
+    dev.main(["bench", "--quick"])
+    dev.main(["bench", "--quick"])
+    added = [arguments for arguments in asked if "--no-deps" in arguments]
+    assert len(added) == 1 and added[0][-2:] == ["stlpips-pytorch==0.0.2", "pypbr==0.1.0b5"]
+
+
+def test_bench_runs_the_suites_named_and_says_when_one_failed(monkeypatch, tmp_path, capsys):
+    ran = []
+    monkeypatch.setattr(dev.subprocess, "call", lambda command, env: ran.append(command) or "speed.py" in command[1])
+    assert dev.bench(["texture", "speed", "--data", "D", "--quick", "-o", str(tmp_path), "--seeds", "2"]) == 1
+    assert [Path(command[1]).name for command in ran] == ["texture.py", "speed.py"]
+    assert ran[0][2:] == ["-o", str(tmp_path / "texture"), "--seeds", "2", "--data", "D", "--quick"]
+    assert "speed: 0 s, FAILED" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wrong", [["nonsense", "--quick"], ["speed"]])
+def test_bench_refuses_an_unknown_suite_and_a_run_without_data(wrong, monkeypatch):
+    monkeypatch.setattr(dev.subprocess, "call", pytest.fail)
+    with pytest.raises(SystemExit):
+        dev.bench(wrong)
+
+
 @pytest.mark.parametrize("change", ["requirements", "python"])
 def test_environment_is_made_anew_when_it_no_longer_fits(clone, monkeypatch, change):
     dev.main(["demo"])
