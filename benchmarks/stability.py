@@ -195,7 +195,8 @@ def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: in
     shown += [srgb_from_linear(crop), srgb_from_linear(np.clip(true, 0, 1))]
     if picture is not None:
         picture.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(picture), (np.concatenate([_tiled(x) for x in shown], 1)[..., ::-1] * 255).round())
+        strip = np.concatenate([_tiled(x) for x in shown], 1)[..., ::-1] * 255
+        cv2.imwrite(str(picture), strip.round().astype(np.uint8))
     return [{"family": family, "severity": severity, "seed": seed} | row for row in rows]
 
 
@@ -299,6 +300,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=tuple(FAMILIES))
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case after so long; go on later")
+    parser.add_argument(
+        "--coarse", action="store_true", help="first, middle and last severities; a later run adds the rest"
+    )
     parser.add_argument("--quick", action="store_true", help="one seed, first and last severities")
     options = parser.parse_args(arguments)
     quick = options.quick
@@ -316,9 +320,14 @@ def main(arguments: list[str] | None = None) -> int:
             chosen = structured if family == "few periods" else any_kind
             material, other = chosen[seed % len(chosen)], any_kind[(seed + 1) % len(any_kind)]
             severities = FAMILIES[family][1]
-            for severity in (severities[0], severities[-1]) if quick else severities:
+            if quick or options.coarse:
+                some = (0, -1) if quick else (0, len(severities) // 2, -1)
+                severities = [severities[i] for i in some]
+            for severity in severities:
                 picture = (
-                    parts.folder / "pictures" / f"{family}.png" if seed == 0 and severity == severities[-1] else None
+                    parts.folder / "pictures" / f"{family}.png"
+                    if seed == 0 and severity == FAMILIES[family][1][-1]
+                    else None
                 )
 
                 def make(family=family, severity=severity, material=material, other=other, seed=seed, picture=picture):
