@@ -4,7 +4,7 @@
     python3 dev.py bench speed --data DATA -o DIR [--errors DIR/endtoend.csv] [--largest 8192]
     python3 dev.py bench speed --quick
 
-Points are preset x decomposer: CPU and wall seconds per material at 1024 px (two bundled regions), against the
+Points are preset x decomposer: CPU and wall seconds per material at 1024 px (a bundled region), against the
 end-to-end error that `endtoend` has measured. Growth: resolution, regions, megapixels of the photo; each run in a
 process of its own, of which the peak memory is stated. `palette` is the command line's four materials of the bundled
 viaduct, from photo to .blend. Wall seconds mean something on an idle machine only. A run that was stopped goes on.
@@ -33,7 +33,7 @@ from material_palette.core import palette  # noqa: E402
 from material_palette.core.image import read_mask, read_photo  # noqa: E402
 from material_palette.core.region import Region, read_regions  # noqa: E402
 
-REGIONS = (("facade", "stone_wall"), ("viaduct", "rubble"))
+PHOTO, REGION = "facade", "stone_wall"  # bundled
 GROWTH = {  # what grows: its values, and the exponent that theory gives
     "resolution": ((256, 512, 1024, 2048, 4096, 8192), 2.0, "px, side of the maps"),
     "regions": ((1, 2, 4, 8, 16, 32), 1.0, "regions of one photo, 256 px"),
@@ -42,15 +42,11 @@ GROWTH = {  # what grows: its values, and the exponent that theory gives
 QUICK = {"resolution": (128, 256), "regions": (1, 2), "megapixels": (0.5, 1)}
 
 
-def photo_of(name: str) -> np.ndarray:
-    return read_photo(ROOT / "examples" / name / "photo.jpg").pixels
-
-
-def measured(what: str, value: float, quality: str = "balanced", decomposer: str = "unet", region: int = 0) -> dict:
+def measured(what: str, value: float, quality: str = "balanced", decomposer: str = "unet") -> dict:
     """CPU and wall seconds and peak memory of one extraction in this process, after a small one has warmed it up."""
-    name, mask_name = REGIONS[region]
-    pixels = photo_of(name)
-    mask = read_mask(ROOT / "examples" / name / "masks" / f"{mask_name}.png", pixels.shape[:2])
+    folder = ROOT / "examples" / PHOTO
+    pixels = read_photo(folder / "photo.jpg").pixels
+    mask = read_mask(folder / "masks" / f"{REGION}.png", pixels.shape[:2])
     resolution = {"resolution": value, "regions": 256, "megapixels": 512}.get(what, value)
     settings = palette.Settings(resolution=int(resolution), quality=quality, decomposer=decomposer)
     if what == "megapixels":
@@ -60,7 +56,7 @@ def measured(what: str, value: float, quality: str = "balanced", decomposer: str
     regions = [Region("region", mask)]
     if what == "regions":
         # pieces of all bundled regions, about alike in size whatever their number
-        every = [r.mask for r in read_regions(ROOT / "examples" / name / "masks", pixels.shape[:2])]
+        every = [r.mask for r in read_regions(folder / "masks", pixels.shape[:2])]
         regions = [Region(f"region {i}", piece) for i, piece in enumerate(pieces(np.any(every, 0), int(value)))]
     warm = palette.Settings(resolution=64, quality="draft", decomposer=decomposer)
     palette.extract_palette(pixels[:200, :200], [Region("warm", np.ones((200, 200), bool))], warm, _quiet)
@@ -221,16 +217,18 @@ def main(arguments: list[str] | None = None) -> int:
             rows.append({"measurement": name} | found)
         return found
 
+    if "palette" in wanted and not quick:
+        found = parts.get("palette", lambda: whole_palette(options.output.parent / "parts" / "palette"))
+        if found:
+            about["palette of 4 materials, 1024 px, balanced"] = found
+            print(f"palette: {found['wall_seconds']:.1f} s wall, {found['cpu_seconds']:.1f} s CPU", flush=True)
     if "points" in wanted:
-        for quality in ("balanced",) if quick else endtoend.QUALITIES:
-            for decomposer in endtoend.DECOMPOSERS:
+        for decomposer in endtoend.DECOMPOSERS:
+            for quality in ("balanced",) if quick else endtoend.QUALITIES:
                 name = f"ours, {quality}, {decomposer}"
-                found = [
-                    take(f"{name}, {size} px, {REGIONS[i][1]}", 2, "point", size, quality, decomposer, i)
-                    for i in (0, 1)
-                ]
-                if all(found) and name in errors:
-                    points[name] = float(np.mean([f["cpu_seconds"] for f in found])), errors[name]
+                found = take(f"{name}, {size} px", 2, "point", size, quality, decomposer)
+                if found and name in errors:
+                    points[name] = found["cpu_seconds"], errors[name]
     if "growth" in wanted:
         for what, (values, theory, _) in GROWTH.items():
             growth[what] = []
@@ -247,11 +245,6 @@ def main(arguments: list[str] | None = None) -> int:
     if "cores" in wanted and not quick:
         for cores in (1, 2):
             take(f"{cores} cores", cores, "point", size)
-    if "palette" in wanted and not quick:
-        found = parts.get("palette", lambda: whole_palette(options.output.parent / "parts" / "palette"))
-        if found:
-            about["palette of 4 materials, 1024 px, balanced"] = found
-            print(f"palette: {found['wall_seconds']:.1f} s wall, {found['cpu_seconds']:.1f} s CPU")
     if not rows and not about:
         return 0
     about |= {"points": points, "front": measures.pareto(points) if points else [], "errors": errors}
