@@ -154,7 +154,8 @@ def quantiles(albedo: np.ndarray) -> list:
     """`measures.patch_quantiles` of a tile's linear albedo, made as bright as any other: a photo does not tell how
     bright a surface is."""
     albedo = np.asarray(albedo, np.float32)
-    albedo = np.broadcast_to(albedo, (64, 64, 3)) if albedo.ndim == 1 else albedo
+    albedo = albedo.reshape(1, 1, 3) if albedo.ndim == 1 else albedo
+    albedo = np.tile(albedo, (*(-(-64 // n) for n in albedo.shape[:2]), 1))  # patches at all scales
     gain = 0.18 / max(float((albedo @ LUMINANCE).mean()), 1e-4)
     return measures.patch_quantiles(srgb_from_linear(np.clip(albedo * gain, 0, 1)))
 
