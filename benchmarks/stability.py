@@ -26,7 +26,7 @@ import dev  # noqa: E402
 
 dev.load_package()
 from material_palette.benchmarks import charts, endtoend, measures, records, svbrdf  # noqa: E402
-from material_palette.benchmarks.baselines import cross_fade  # noqa: E402
+from material_palette.benchmarks.baselines import cross_fade, largest_square  # noqa: E402
 from material_palette.benchmarks.exemplar import photograph  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
 from material_palette.core import palette  # noqa: E402
@@ -57,6 +57,7 @@ FAMILIES: dict[str, tuple[str, tuple[float, ...]]] = {  # what the severity is; 
 }
 STRUCTURED = ("brick", "tiles", "paving", "roof", "bricks", "planks")  # classes that `few periods` takes
 SLANT = "the slant of the region could not be told"  # said of nearly all that is stochastic: counts where it matters
+LEAST_FADED = 8  # px: a smaller square is repeated as it is
 METHODS = ("ours", "square crop, cross-faded")
 
 
@@ -191,7 +192,9 @@ def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: in
         row |= {"refused": True, "warned": True, "warnings": re.sub(r"\d+", "#", str(error))}
         shown.append(np.zeros((8, 8, 3), np.float32))
     rows.append(row | {"cpu_seconds": time.process_time() - start})
-    crop = linear_from_srgb(cross_fade(srgb_from_linear(photo), mask, 0, 0)[0])
+    crop = photo[largest_square(mask)]
+    if min(crop.shape[:2]) >= LEAST_FADED:
+        crop = linear_from_srgb(cross_fade(srgb_from_linear(photo), mask, 0, 0)[0])
     rows.append({"method": METHODS[1], "refused": False, "warned": False} | judged(crop, true, target))
     shown += [srgb_from_linear(crop), srgb_from_linear(np.clip(true, 0, 1))]
     if picture is not None:
