@@ -463,6 +463,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--against", default="constant prior", help="the row that delta is relative to")
     parser.add_argument("--collections", nargs="+", help="held-out collections that count; default: all")
     parser.add_argument("--quick", action="store_true", help="polyhaven if there, 256 px, one seed, no cost")
+    parser.add_argument("--size", type=int, help=f"px of what is decomposed ({SIZE}; with --quick 256)")
     parser.add_argument("--no-cost", action="store_true", help="without seconds and memory")
     parser.add_argument("--cost", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -471,7 +472,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.cost:
         print_cost(options.rows[0], options.cost, held_out)
         return 0
-    size, seeds = (256, SEEDS[:1]) if options.quick else (SIZE, SEEDS)
+    size, seeds = options.size or (256 if options.quick else SIZE), SEEDS[:1] if options.quick else SEEDS
     collections = (
         ["polyhaven"] if options.quick and (options.data / "pbr" / "polyhaven").is_dir() else options.collections
     )

