@@ -355,7 +355,9 @@ def write_chart(summary: dict, folder: Path) -> None:
         full = entry["exemplars"] == everywhere
         axes.plot(x, y, "o", color=colour, markerfacecolor=colour if full else "white", ms=6, zorder=3)
         label = LABELS[engine] + ("" if full else f" ({entry['exemplars']} of {everywhere})")
-        where, align = ((-7, 4), "right") if x > 60 else ((7, -11 if engine == "balanced" else 4), "left")
+        where, align = (
+            ((-7, 4), "right") if x > 60 or engine == TINY else ((7, -11 if engine == "balanced" else 4), "left")
+        )
         axes.annotate(label, (x, y), where, textcoords="offset points", ha=align)
     axes.set_xscale("log")
     axes.set_yscale("log")
