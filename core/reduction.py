@@ -25,7 +25,7 @@ from .brdf import shade
 from .flip import flip
 from .image import linear_from_srgb, srgb_from_linear
 from .material import SVBRDF
-from .torus import resize
+from .torus import frequencies, resize
 
 VISIBLE = 0.05  # FLIP, mean over a window
 WINDOW = 128  # px, two degrees of the view
@@ -185,8 +185,23 @@ def _shrunk(value: np.ndarray, side: int) -> np.ndarray:
         return value.mean((0, 1), dtype=np.float64).astype(np.float32)
     if side == _side(value):
         return value
-    small = resize(value.reshape(*value.shape[:2], -1), (side, side)).reshape(side, side, *value.shape[2:])
+    small = _resampled(value.reshape(*value.shape[:2], -1), side).reshape(side, side, *value.shape[2:])
     return np.clip(small, value.min(), value.max())
+
+
+def _resampled(value: np.ndarray, side: int) -> np.ndarray:
+    """Square texels (n, n, C) on the torus at a smaller side: all that it can hold of the spectrum, unchanged. A blur
+    against aliasing before it would show where the texels are as large as pixels."""
+    n = len(value)
+    spectrum = torch.fft.rfft2(torch.from_numpy(np.ascontiguousarray(value.transpose(2, 0, 1))))
+    most = (side - 1) // 2
+    kept = torch.zeros(value.shape[2], side, side // 2 + 1, dtype=spectrum.dtype)
+    kept[:, : most + 1, : most + 1] = spectrum[:, : most + 1, : most + 1]
+    kept[:, -most:, : most + 1] = spectrum[:, -most:, : most + 1]
+    # texels lie at the centres of their squares, which become larger
+    v, u = frequencies(side, side)
+    kept = kept * torch.exp(0.5j * (1 - side / n) * (v + u)) * (side / n) ** 2
+    return np.ascontiguousarray(torch.fft.irfft2(kept, s=(side, side)).permute(1, 2, 0).numpy())
 
 
 def _shrunk_normal(normal: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +212,7 @@ def _shrunk_normal(normal: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarra
     both = np.concatenate([slopes, np.square(slopes).sum(-1, keepdims=True)], -1)
     if side == 0:
         return FLAT, both[..., 2].mean(dtype=np.float64).astype(np.float32)
-    small = resize(both, (side, side))
+    small = _resampled(both, side)
     smooth = np.concatenate([small[..., :2], np.ones_like(small[..., :1])], -1)
     variance = np.maximum(small[..., 2] - np.square(small[..., :2]).sum(-1), 0)
     return smooth / np.linalg.norm(smooth, axis=-1, keepdims=True), variance
