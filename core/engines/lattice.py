@@ -75,6 +75,6 @@ def _period(correlation: np.ndarray) -> float | None:
         if at(period) < LEAST_PEAK:
             continue
         # a running bond: every second course agrees better
-        doubled = 2 * period < reach and at(2 * period) > at(period) + 0.15
+        doubled = 2 * period < reach and at(2 * period) > at(period) + 0.15 and contrast(2 * period) >= LEAST_CONTRAST
         return float(2 * period if doubled else period)
     return None
