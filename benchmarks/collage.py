@@ -1,4 +1,5 @@
-"""Photos with known materials: collages of real textures under shading, perspective and shadows, and rendered scenes.
+"""Photos with known materials: collages of textures under shading, perspective and shadows, rendered scenes, and real
+photos with some patches labelled by hand.
 
 A collage is cut into wavy or straight-edged cells, more cells than materials, so that a material lies in several
 places. Each cell is a plane of its own: turned, tilted, brighter or darker. Over all lie a slow change of light, a cast
@@ -15,17 +16,21 @@ import numpy as np
 
 from ..core.image import linear_from_srgb, read_mask, read_photo, srgb_from_linear
 
+LABELS = Path(__file__).with_name("photos.json")
+SKY = "sky"
 LEAST_SHARE = 0.03  # of the photo, per material
 FREE = ("CC0", "CC-BY 3", "CC-BY-4", "MIT", "ublic domain", "ublic-domain")
 
 
 @dataclass
 class Truth:
-    """A photo (H, W, 3) linear float32 and its materials (H, W) int: 0.. per material, -1 where unknown."""
+    """A photo (H, W, 3) linear float32 and its materials (H, W) int: 0.. per material, -1 where unknown; the first
+    `scored` of them count, None: all."""
 
     name: str
     pixels: np.ndarray
     labels: np.ndarray
+    scored: int | None = None
 
 
 @dataclass
@@ -76,6 +81,28 @@ def scenes(data: Path) -> list[Truth]:
         for index, part in enumerate(json.loads((folder / "truth.json").read_text(encoding="utf-8"))):
             labels[read_mask(folder / "masks" / f"{part}.png", labels.shape)] = index
         found.append(Truth(folder.name, pixels, labels))
+    return found
+
+
+def photos(data: Path, file: Path = LABELS) -> list[Truth]:
+    """Real photos of the data folder of which some patches are labelled by hand in `file`, in its order.
+
+    A patch is [left, top, right, bottom] in percent of the photo, well within a material. "sky" comes last
+    among the labels: it is no material to find, but should be in none.
+    """
+    found = []
+    for name, materials in json.loads(file.read_text(encoding="utf-8")).items():
+        path = data / "photos" / f"{name}.jpg"
+        if not path.exists():
+            continue
+        pixels = read_photo(path).pixels
+        height, width = pixels.shape[:2]
+        labels = np.full((height, width), -1)
+        for index, material in enumerate(sorted(materials, key=lambda material: material == SKY)):
+            for left, top, right, bottom in materials[material]:
+                rows = slice(int(top * height / 100), int(bottom * height / 100))
+                labels[rows, int(left * width / 100) : int(right * width / 100)] = index
+        found.append(Truth(name, pixels, labels, len(materials) - (SKY in materials)))
     return found
 
 

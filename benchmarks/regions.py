@@ -23,25 +23,27 @@ def iou(mask: np.ndarray, other: np.ndarray) -> float:
     return np.count_nonzero(mask & other) / union if union else 1.0
 
 
-def mean_iou(labels: np.ndarray, truth: np.ndarray) -> float:
+def mean_iou(labels: np.ndarray, truth: np.ndarray, scored: int | None = None) -> float:
     """Mean over the true materials of the IoU with the region given to each; no region is given to two.
 
     labels, truth (H, W) int, -1: none. Pixels of unknown material don't count. The assignment is the best there is.
+    scored: the first so many materials count in the mean (all); the others only as what should not be in a region.
     """
     known = truth >= 0
     found, count = labels[known], truth.max() + 1
+    scored = count if scored is None else scored
     overlap = np.zeros((found.max(initial=-1) + 2, count))
     np.add.at(overlap, (found + 1, truth[known]), 1)
     sizes = overlap.sum(1, keepdims=True)
-    scores = (overlap / (sizes + overlap.sum(0) - overlap))[1:]
+    scores = (overlap / np.maximum(sizes + overlap.sum(0) - overlap, 1))[1:, :scored]
     best = {0: 0.0}  # bit set of materials that have a region -> sum of IoU
     for row in scores:
         for chosen, total in list(best.items()):
-            for material in range(count):
+            for material in range(scored):
                 if not chosen >> material & 1 and row[material] > 0:
                     key = chosen | 1 << material
                     best[key] = max(best.get(key, 0.0), total + row[material])
-    return max(best.values()) / count
+    return max(best.values()) / scored
 
 
 def boundary_f(labels: np.ndarray, truth: np.ndarray) -> float:

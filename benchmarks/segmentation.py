@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
 """Regions against true masks: `auto` and `pick` beside their opponents, on the same photos in one run.
 
-    python benchmarks/segmentation.py --data DATA -o benchmarks/results/segmentation/     about 20 minutes on one core
-    python benchmarks/segmentation.py --data DATA -o DIR --only auto stability   some of: auto pick stability time sheet
+    python benchmarks/segmentation.py --data DATA -o benchmarks/results/segmentation/     about 40 minutes on one core
+    python benchmarks/segmentation.py --data DATA -o DIR --only photos auto   some of: photos auto stability pick time
+    python benchmarks/segmentation.py --data DATA -o DIR --quick
 
 DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages are made of textures of the test split,
-which nothing was fitted on; no scene and none of its materials was either. Writes segmentation.csv, a row per measure,
-photo and method, as it goes (a second call goes on where the first ended), segmentation.json and sheet.jpg.
+which nothing was fitted on; no scene and none of its materials was either. Of real photos, patches are labelled by hand
+(photos.json): what is measured there is which patches are together, not where borders lie. Writes segmentation.csv, a
+row per measure, photo and method, as it goes (a second call goes on where the first ended), segmentation.json, the
+chart and sheet.jpg.
 """
 
 import argparse
@@ -17,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from itertools import zip_longest
 from pathlib import Path
 
 import cv2
@@ -27,8 +31,9 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
+from material_palette.benchmarks import charts, records  # noqa: E402
 from material_palette.benchmarks import regions as measures  # noqa: E402
-from material_palette.benchmarks.collage import collage, scenes, sources  # noqa: E402
+from material_palette.benchmarks.collage import collage, photos, scenes, sources  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
 from material_palette.core.segmentation import segment  # noqa: E402
@@ -38,7 +43,7 @@ from material_palette.core.segmentation.pick import Click, select  # noqa: E402
 COLLAGES = 12
 BOUND = 6  # the user's upper bound, as by default
 SHOWN = ("kodak_", "azure_")  # photos that may be shown
-PARTS = ("auto", "stability", "pick", "time", "sheet")
+PARTS = ("photos", "auto", "stability", "pick", "time", "sheet")
 
 
 def ours(pixels: np.ndarray, count: int) -> np.ndarray:
@@ -96,7 +101,8 @@ class Table:
     def summary(self) -> dict:
         found = defaultdict(list)
         for part, photo, method, measure, value in self.rows:
-            found[part, photo.split("_")[0] if part != "time" else photo, method, measure].append(float(value))
+            kind = {"time": photo, "photos": "photo"}.get(part, photo.split("_")[0])
+            found[part, kind, method, measure].append(float(value))
         return {
             " | ".join(key): {
                 "median": round(float(np.median(values)), 4),
@@ -106,6 +112,22 @@ class Table:
             }
             for key, values in found.items()
         }
+
+
+def real_photos(table: Table, photos: list) -> None:
+    for photo in photos:
+        for name, method in WHOLE.items():
+            if ("photos", photo.name, name) not in table.done and method is not measures.grabcut:
+                labels = method(photo.pixels, BOUND)
+                table.add("photos", photo.name, name, iou=measures.mean_iou(labels, photo.labels, photo.scored))
+                if method is ours:
+                    cv2.imwrite(str(_kept(table.path.parent, photo.name)), (labels + 1).astype(np.uint8))
+
+
+def _kept(folder: Path, name: str) -> Path:
+    """Where the regions of a photo are kept for the sheet; not a result."""
+    (folder / "regions").mkdir(exist_ok=True)
+    return folder / "regions" / f"{name}.png"
 
 
 def whole_photos(table: Table, photos: list) -> None:
@@ -191,30 +213,44 @@ def measure_time(data: Path, part: str) -> None:
     print(json.dumps([wall, cpu, change, megabytes]))
 
 
-def sheet(data: Path, folder: Path, every: bool) -> None:
-    """Photo and regions side by side; beside the sheet the words about what was left out."""
-    tiles, words = [], []
+def sheet(data: Path, folder: Path) -> None:
+    """Photos that may be shown, and their regions."""
+    tiles = []
     for path in sorted((data / "photos").glob("*.jpg")):
-        if not every and not path.name.startswith(SHOWN):
+        if not path.name.startswith(SHOWN):
             continue
         pixels = read_photo(path).pixels
-        regions = segment(pixels, regions=BOUND, warn=lambda text, path=path: words.append(f"{path.stem}: {text}"))
+        kept = _kept(folder, path.stem)
+        labels = cv2.imread(str(kept), cv2.IMREAD_GRAYSCALE).astype(int) - 1 if kept.exists() else ours(pixels, 0)
         image = np.round(255 * np.clip(srgb_from_linear(pixels), 0, 1)).astype(np.uint8)[..., ::-1]
         drawn = image // 4
-        for index, region in enumerate(regions):
+        for index in range(labels.max() + 1):
             hue = np.uint8([[[index * 180 // BOUND, 220, 255]]])
             colour = cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0]
-            drawn[region.mask] = image[region.mask] // 2 + colour // 2
-        scale = 150 / image.shape[0]
+            drawn[labels == index] = image[labels == index] // 2 + colour // 2
+        scale = 200 / image.shape[0]
         small = [cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for x in (image, drawn)]
-        tile = np.zeros((154, 460, 3), np.uint8)
-        pair = np.hstack(small)[:150, :460]
+        tile = np.zeros((204, 612, 3), np.uint8)
+        pair = np.hstack(small)[:200, :608]
         tile[: pair.shape[0], : pair.shape[1]] = pair
         tiles.append(tile)
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 3)
-    rows = [np.hstack(tiles[start : start + 3]) for start in range(0, len(tiles), 3)]
-    cv2.imwrite(str(folder / ("every.png" if every else "sheet.jpg")), np.vstack(rows))
-    (folder / ("every.txt" if every else "sheet.txt")).write_text("\n".join(words) + "\n", encoding="utf-8")
+    if tiles:
+        tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 2)
+        rows = [np.hstack(tiles[start : start + 2]) for start in range(0, len(tiles), 2)]
+        cv2.imwrite(str(folder / "sheet.jpg"), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def chart(table: Table, folder: Path) -> None:
+    """Mean IoU per method, on each kind of photo, and of clicks."""
+    panels = defaultdict(lambda: defaultdict(list))
+    for part, photo, method, measure, value in table.rows:
+        kind = {"scene": "scenes", "collage": "collages"}.get(photo.split("_")[0], "real photos")
+        if part in ("photos", "auto") and measure == "iou":
+            panels[f"{kind}: IoU"][method].append(float(value))
+        elif part == "pick" and measure in ("iou_1", "iou_3") and "best" not in method:
+            panels[f"IoU after {'1 click' if measure == 'iou_1' else '3 clicks'}"][method].append(float(value))
+    if panels:
+        charts.bars(panels, folder / "segmentation")
 
 
 def main(given: list[str] | None = None) -> int:
@@ -223,9 +259,8 @@ def main(given: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--collages", type=int, default=COLLAGES)
-    parser.add_argument("--every-photo", action="store_true", help="all photos on the sheet, not only those to share")
     parser.add_argument("--measure", choices=("auto", "pick"), help=argparse.SUPPRESS)
-    parser.add_argument("--quick", action="store_true", help="two collages, whole photos only")
+    parser.add_argument("--quick", action="store_true", help="two collages, four methods")
     arguments = parser.parse_args(given)
     if arguments.measure:
         measure_time(arguments.data, arguments.measure)
@@ -238,16 +273,22 @@ def main(given: list[str] | None = None) -> int:
     rendered = scenes(arguments.data)[: 0 if arguments.quick else None]
     for photo in rendered:
         photo.name = "scene_" + photo.name
-    photos = rendered + [collage(choices, seed) for seed in range(arguments.collages)]
+    if "photos" in arguments.only:
+        real_photos(table, photos(arguments.data))
+    made = [collage(choices, seed) for seed in range(arguments.collages)]
+    # scenes and collages in turn: a run that is stopped has some of both
+    known = [photo for pair in zip_longest(rendered, made) for photo in pair if photo is not None]
     for part, run in (("auto", whole_photos), ("stability", stability), ("pick", clicks)):
         if part in arguments.only:
-            run(table, photos if part != "stability" else photos[::2])
+            run(table, known if part == "auto" else known[: len(known) // 2])
     if "time" in arguments.only:
         times(table, arguments.data)
     if "sheet" in arguments.only:
-        sheet(arguments.data, arguments.output, arguments.every_photo)
-    text = json.dumps(table.summary(), indent=1)
+        sheet(arguments.data, arguments.output)
+    facts = {"command": records.command(), "commits": [records.commit()], "machine": records.machine()}
+    text = json.dumps(facts | {"summary": table.summary()}, indent=1)
     (arguments.output / "segmentation.json").write_text(text + "\n", encoding="utf-8")
+    chart(table, arguments.output)
     print(text)
     return 0
 

@@ -10,24 +10,26 @@ from bpy.types import Operator
 from ..core.errors import PaletteError
 from .draw_region import OverPhoto, draw_line
 from .photo import photo_reader
+from .preferences import pick_weights
 from .regions import add_region, set_mask
 
 _DRAG = 300.0  # px of dragging for the whole range of the tolerance
-_features = {}  # of one photo: they take a second and are the same for every click
+_features = {}  # what has looked at one photo: that takes a second and is the same for every click
 
 
-def features_of(photo, progress=lambda fraction, message: None):
-    """What `core.segmentation` finds in the photo's pixels; raises PaletteError when it can't be read."""
-    key = _key(photo)
+def picker_of(photo, weights=""):
+    """What answers clicks on the photo; raises PaletteError when photo or weights can't be read."""
+    key = _key(photo, weights)
     if key not in _features:
-        describe(key, photo_reader(photo), progress)
+        look(key, photo_reader(photo), weights)
     return _features[key]
 
 
-def describe(key, read, progress):
-    from ..core.segmentation.features import describe as look
+def look(key, read, weights):
+    from ..core.segmentation import picker
 
-    found = look(read()[0], progress)
+    found = picker(weights)
+    found.look(read()[0])
     _features.clear()
     _features[key] = found
 
@@ -36,26 +38,31 @@ def forget():
     _features.clear()
 
 
-def select(photo, clicks, tolerance):
+def select(photo, clicks, tolerance, weights="", box=None):
     """(H, W) bool of the photo's size: what is of the clicked material.
 
-    clicks: (x, y, positive) in px of the photo from its upper left corner.
+    clicks: (x, y, positive) in px of the photo from its upper left corner. weights: of Segment Anything or
+    Materialistic instead of what ships; the first also takes a box, (left, top, right, bottom) in px of the photo.
     """
-    from ..core.segmentation.pick import Click, select
+    from ..core.segmentation.pick import Click
 
-    features = features_of(photo)
+    found = picker_of(photo, weights)
     width, height = photo.size
-    rows, columns = features.shape
+    rows, columns = found.shape
     scaled = [Click(x * columns / width, y * rows / height, positive) for x, y, positive in clicks]
-    mask = select(features, scaled, tolerance)
+    if box is None:
+        mask = found.select(scaled, tolerance)
+    else:
+        scale = (columns / width, rows / height) * 2
+        mask = found.select(scaled, tolerance, box=tuple(a * b for a, b in zip(box, scale, strict=True)))
     if mask.shape != (height, width):  # a huge photo is reduced when it is read
         across = (np.arange(height) * rows // height)[:, None], np.arange(width) * columns // width
         mask = mask[across]
     return mask
 
 
-def _key(photo):
-    return photo.session_uid, tuple(photo.size), photo.filepath_raw
+def _key(photo, weights):
+    return photo.session_uid, tuple(photo.size), photo.filepath_raw, weights
 
 
 class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
@@ -69,10 +76,19 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
         name="Extend", description="Begin with the active region's material", options={"SKIP_SAVE", "HIDDEN"}
     )
 
-    hint = "Click a material, drag for tolerance   Shift: add a place   Ctrl: take one away   Esc or right button: done"
+    @property
+    def hint(self):
+        box = "   Alt and drag: box" if self.takes_box else ""
+        return f"Click, drag for tolerance   Shift: add a place   Ctrl: take one away{box}   Esc or right button: done"
+
+    @property
+    def takes_box(self):
+        found = _features.get(_key(self.photo, self.weights))  # not there yet: still looking at the photo
+        return found is not None and found.takes_box
 
     def invoke(self, context, event):
         self.clicks, self.tolerance, self.key = [], 0.5, None
+        self.box, self.corner, self.weights = None, None, pick_weights(context)
         self.pressed, self.at_press, self.shown = None, 0.5, 0.5
         self.failure, self.thread = None, None
         result = super().invoke(context, event)
@@ -82,7 +98,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
 
     def _look(self, context):
         """Find the photo's features on a thread: the first click must not wait in a frozen window."""
-        key = _key(self.photo)
+        key, weights = _key(self.photo, self.weights), self.weights
         if key in _features:
             return
         try:
@@ -93,7 +109,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
 
         def work():
             try:
-                describe(key, read, lambda fraction, message: None)
+                look(key, read, weights)
             except Exception as error:
                 self.failure = error
 
@@ -112,12 +128,24 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
             width, height = self.photo.size
             if not (0 <= x < width and 0 <= y < height):
                 return {"RUNNING_MODAL"}
+            if event.alt and self.takes_box:
+                self.clicks, self.key, self.box, self.corner = [], None, None, place
+                return {"RUNNING_MODAL"}
             if not (event.shift or event.ctrl):
-                self.clicks, self.key = [], None  # another material
-            if self.clicks or not event.ctrl:
+                self.clicks, self.key, self.box = [], None, None  # another material
+            if self.clicks or self.box or not event.ctrl:
                 self.clicks.append((x, y, not event.ctrl))
                 self.pressed, self.at_press = place, self.tolerance
                 self._apply(context)
+        elif self.corner is not None and event.type in {"MOUSEMOVE", "LEFTMOUSE"}:
+            self.box = self._box(place)
+            if event.type == "LEFTMOUSE" and event.value == "RELEASE":
+                self.corner = None
+                if min(self.box[2] - self.box[0], self.box[3] - self.box[1]) < 1:
+                    self.box = None
+                else:
+                    self._apply(context)
+                    bpy.ops.ed.undo_push(message="Pick Material")
         elif event.type == "MOUSEMOVE" and self.pressed is not None:
             change = (place[0] - self.pressed[0]) / _DRAG
             self.tolerance = min(max(self.at_press + change, 0.0), 1.0)
@@ -132,6 +160,15 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
 
+    def _box(self, place):
+        """(left, top, right, bottom) in px of the photo, of what is dragged so far."""
+        (x, y), (u, v) = self.in_photo(self.corner), self.in_photo(place)
+        self.dragged = self.corner, place
+        width, height = self.photo.size
+        left, right = (min(max(at, 0), width) for at in sorted((x, u)))
+        top, bottom = (min(max(at, 0), height) for at in sorted((y, v)))
+        return left, top, right, bottom
+
     def _apply(self, context):
         settings = context.scene.material_palette
         if self.thread is not None:
@@ -139,7 +176,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
         if self.failure is not None:
             return
         self.shown = self.tolerance
-        mask = select(self.photo, self.clicks, self.tolerance)
+        mask = select(self.photo, self.clicks, self.tolerance, self.weights, self.box)
         region = next((r for r in settings.regions if r.key == self.key), None)
         if region is None:
             self.key = add_region(settings, "Picked", mask).key
@@ -150,6 +187,9 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
         context.workspace.status_text_set(f"{text}   {self.hint}")
 
     def draw_marks(self):
+        if self.corner is not None and self.box is not None:
+            (x, y), (u, v) = self.dragged
+            draw_line([(x, y), (u, y), (u, v), (x, v), (x, y)])
         if self.pressed is not None:
             x, y = self.pressed
             draw_line([(x - _DRAG * self.at_press, y), (x + _DRAG * (1.0 - self.at_press), y)])

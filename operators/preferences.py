@@ -44,6 +44,12 @@ def diffusion_settings(context):
     }
 
 
+def pick_weights(context):
+    """Path of the weights that Pick Material uses instead of what ships, or ""."""
+    chosen = preferences(context)
+    return bpy.path.abspath(chosen.pick_weights) if chosen is not None else ""
+
+
 class MATERIAL_PALETTE_preferences(AddonPreferences):
     bl_idname = PACKAGE
 
@@ -82,6 +88,12 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
             ("cpu", "CPU", "Slow: minutes for each material"),
         ),
     )
+    pick_weights: StringProperty(
+        name="Pick With",
+        description="Weights for Pick Material: a folder of Segment Anything's or a file of Materialistic's; else "
+        "what ships",
+        subtype="FILE_PATH",
+    )
     author: StringProperty(name="Author", description="Written into the assets that are made")
     licence: StringProperty(name="Licence", description="Written into the assets that are made, such as CC0")
 
@@ -101,7 +113,7 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
             row.label(text=f"Missing: {', '.join(lacking)}" if lacking else "Ready")
         column = box.column()
         column.use_property_split = True
-        for name in ("model", "fetch", "concepts", "device"):
+        for name in ("model", "fetch", "concepts", "device", "pick_weights"):
             column.prop(self, name)
         if missing():
             column = box.column(align=True)

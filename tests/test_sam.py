@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 from material_palette.core.errors import PaletteError
-from material_palette.core.segmentation import sam, segment
-from material_palette.core.segmentation.pick import Click
+from material_palette.core.segmentation import picker, sam, segment
+from material_palette.core.segmentation.pick import Click, Pick
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +210,17 @@ def test_onnx_prompts_are_those_of_the_export(exported, photo):
     lower = 64 if exported[0] == "sam2" else 32
     assert seen[0]["point_coords"][0, 2:].tolist() == [[0, 0], [64, lower]]
     assert seen[1]["point_labels"].tolist() == [[1, -1]]
+
+
+def test_weights_decide_what_answers_clicks(exported, photo, tmp_path):
+    found = picker(exported[1])
+    assert isinstance(found, sam.Sam) and found.takes_box
+    assert isinstance(picker(), Pick) and isinstance(picker(""), Pick)
+    with pytest.raises(PaletteError, match="Materialistic"):
+        picker(tmp_path / "weights.ckpt")
+    found.look(photo)
+    areas = [found.select([Click(40, 20)], tolerance).sum() for tolerance in (0.0, 0.5, 1.0)]
+    assert areas == sorted(areas) and areas[0] < areas[2]
 
 
 def test_onnx_models_of_another_kind_are_refused(exported, tmp_path):

@@ -1,14 +1,16 @@
 """How models/segmentation.safetensors was made: a linear discriminant of superpixels, fitted on collages.
 
-    .venv/bin/python training/segmentation.py DATA
+    .venv/bin/python training/segmentation.py --data DATA              # about 3 minutes on one core
+    .venv/bin/python training/segmentation.py --data DATA --quick -o dist/segmentation.safetensors
 
 DATA is a folder with INDEX.csv, pbr/ and textures/. The collages (benchmarks/collage.py) are of textures under CC0,
 CC-BY, MIT or in the public domain, none of them of the test split or in a rendered scene, recoloured at random. Within
 scatter is that of a material over its superpixels in one collage (light, tilt, place, grain), between scatter that of
 the means of materials in one collage; the directions that maximise their ratio are kept and scaled so that within
-scatter is 1 along each (Fisher 1936). About 3 minutes.
+scatter is 1 along each (Fisher 1936).
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -48,11 +50,19 @@ def discriminant(within: np.ndarray, between: np.ndarray, directions: int) -> np
     return whitening @ vectors[:, ::-1][:, :directions]
 
 
-def main() -> None:
-    choices = sources(Path(sys.argv[1]), "free")
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("-o", "--output", type=Path, default=features.DISCRIMINANT)
+    parser.add_argument("--quick", action="store_true", help="two collages, to see that it runs; not to be used")
+    arguments = parser.parse_args(argv)
+    if arguments.quick and arguments.output == features.DISCRIMINANT:
+        parser.error("--quick needs -o: it would overwrite the weights that ship")
+    collages = 2 if arguments.quick else COLLAGES
+    choices = sources(arguments.data, "free")
     within, between, mean = [], [], []
-    for seed in range(FIRST_SEED, FIRST_SEED + COLLAGES):
-        truth = collage(choices, seed, recolour=RECOLOUR)
+    for index in range(collages):
+        truth = collage(choices, FIRST_SEED + index, recolour=RECOLOUR)
         found = features.measure(truth.pixels, lambda fraction, message: None)
         statistics = features.smoothed_plainly(found.statistics, found)
         labels = cv2.resize(truth.labels.astype(np.uint8), found.labels.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -62,15 +72,16 @@ def main() -> None:
         within += covariances
         between.append(means)
         mean.append(statistics.mean(0))
-        print(f"{seed - FIRST_SEED + 1} of {COLLAGES}", end="\r", flush=True)
+        print(f"{index + 1} of {collages}", end="\r", flush=True)
     between = np.concatenate(between)
     projection = discriminant(np.mean(within, 0), between.T @ between / len(between), DIRECTIONS)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
     write_tensors(
-        features.DISCRIMINANT,
+        arguments.output,
         {"mean": np.mean(mean, 0).astype(np.float32), "projection": projection.astype(np.float32)},
         {"made by": "training/segmentation.py", "textures": ", ".join(source.name for source in choices)},
     )
-    print(f"{len(choices)} textures, {len(within)} materials in {COLLAGES} collages -> {features.DISCRIMINANT}")
+    print(f"{len(choices)} textures, {len(within)} materials in {collages} collages -> {arguments.output.name}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Automatic regions: a photo to its materials' masks, by engines chosen by name."""
+"""Regions of a photo: found by engines chosen by name, or selected by clicks."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,8 +8,9 @@ import numpy as np
 from ..errors import PaletteError
 from ..region import Region
 from .auto import segment_auto
-from .materialistic import segment_materialistic
-from .sam import segment_sam
+from .materialistic import Materialistic, segment_materialistic
+from .pick import Pick
+from .sam import Sam, segment_sam
 
 SEGMENTERS = {"auto": segment_auto, "sam": segment_sam, "materialistic": segment_materialistic}
 MOST_REGIONS = 32
@@ -40,3 +41,16 @@ def segment(
             f"Segmentation '{engine}' found no region large enough for a texture. Use a larger photo or paint masks."
         )
     return found
+
+
+def picker(weights: str | Path | None = None) -> Pick | Sam | Materialistic:
+    """What answers clicks on a photo: `look(pixels, progress)` once, then `select(clicks, tolerance)` at will.
+
+    Without `weights` the embedded `Pick`; with the folder of a Segment Anything model `Sam`, which also takes a `box`;
+    with another file or folder `Materialistic`. Raises PaletteError when these can't be loaded.
+    """
+    if not weights:
+        return Pick()
+    path = Path(weights)
+    segment_anything = (path / "config.json").exists() or any(path.glob("*coder*.onnx"))
+    return Sam(path) if segment_anything else Materialistic(path)

@@ -30,7 +30,8 @@ SIZE_POWER = 0.4  # p
 TOUCHING_UNTIL = 40  # regions; from there on regions that don't touch may merge too
 ONE_MATERIAL = 16.0  # squared distance of two regions' vectors; below it they are one material
 LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and are left out
-OVEREXPOSED = 99.0  # L of white
+CLIPPED = 99.5  # of L: white, all three channels at their end
+CLIPPED_SHARE = 0.75  # of a region; what has more than a quarter of its pixels left holds a texture
 SKY_BLUE = 8.0  # -b
 SMOOTH = -3.6  # logarithm of a band's contrast; below it there is nothing but the camera's noise
 
@@ -218,8 +219,9 @@ def _no_surface(features: Features, inside: np.ndarray) -> str | None:
     """Why superpixels (n,) bool hold no texture of a surface, None when they do."""
     size = features.size[inside]
     pixels = features.lab[inside[features.labels]]
-    if np.mean(pixels[:, 0] >= OVEREXPOSED) > 0.5:
-        return "is overexposed"
+    clipped = np.mean(pixels[:, 0] >= CLIPPED)
+    if clipped > CLIPPED_SHARE:
+        return f"is overexposed ({clipped:.0%} of it is plain white)"
     bands = np.average(features.statistics[inside][:, BAND_COLUMNS], axis=0, weights=size)
     top = inside[features.labels[0]].mean()
     lightness, blueness = np.median(pixels[:, 0]), -np.median(pixels[:, 2])

@@ -27,6 +27,8 @@ WANTED = "the checkpoint that the authors of Materialistic publish (ViT-B/8), or
 class Materialistic:
     """A network and one photo: `Materialistic(file)`, `look(pixels)`, then `select` as often as wanted."""
 
+    takes_box = False
+
     def __init__(self, path: str | Path | None):
         """Load the network. Raises PaletteError without a file, or when it is none of this network."""
         self.net = _load(path)

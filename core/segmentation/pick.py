@@ -6,12 +6,13 @@ photo: between an absolute one, right for a photo of one material, and a relativ
 then moved to the photo's own edges by a guided filter (He et al. 2010) over the superpixels' margins.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from .features import Features
+from .features import Features, describe
 
 DEFAULT_TOLERANCE = 0.5
 REACH = 8.0  # at tolerance 1; at 0.5 it is a quarter, the best on training collages
@@ -26,6 +27,21 @@ class Click:
     x: float
     y: float
     positive: bool = True
+
+
+class Pick:
+    """The embedded selection as an object: `look(pixels)`, then `select` as often as wanted."""
+
+    takes_box = False
+
+    def look(self, pixels: np.ndarray, progress: Callable[[float, str], None] = lambda fraction, message: None) -> None:
+        """Describe a photo (H, W, 3) linear float32; the slow part, once per photo."""
+        self.features = describe(pixels, progress)
+        self.shape = self.features.shape
+
+    def select(self, clicks: list[Click], tolerance: float = DEFAULT_TOLERANCE) -> np.ndarray:
+        """See the function `select`."""
+        return select(self.features, clicks, tolerance)
 
 
 def select(features: Features, clicks: list[Click], tolerance: float = DEFAULT_TOLERANCE) -> np.ndarray:

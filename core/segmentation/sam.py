@@ -25,18 +25,22 @@ LEAST_SCORE = 0.8  # IoU that the model expects of its mask
 LEAST_STABILITY = 0.9  # IoU of the mask a little larger with it a little smaller (logits of -1 and 1)
 MOST_OVERLAP = 0.7  # IoU; of two masks beyond it the better stays
 LEAST_SHARE = 0.01  # of the photo
+SURENESS = 20.0  # range of the logits over which the tolerance moves the border
 SIDE = 1024  # px, of an ONNX encoder that leaves its canvas open
 
 
 class Sam:
     """A model and one photo: `Sam(folder)`, `look(pixels)`, then `select` as often as wanted, or `everything`."""
 
+    takes_box = True
+
     def __init__(self, folder: str | Path | None):
         """Load the model. Raises PaletteError without a folder, the packages, or weights of these kinds in it."""
         self.model = _load(folder)
 
-    def look(self, pixels: np.ndarray) -> None:
-        """Encode a photo (H, W, 3) linear float32; the slow part, once per photo."""
+    def look(self, pixels: np.ndarray, progress: Callable[[float, str], None] = lambda fraction, message: None) -> None:
+        """Encode a photo (H, W, 3) linear float32; the slow part, once per photo, without a step that could stop it."""
+        progress(0.0, "Looking at the photo")
         self.shape = height, width = pixels.shape[:2]
         encoded = np.clip(srgb_from_linear(np.clip(pixels, 0, 1)), 0, 1)
         if self.model.stretches:
@@ -48,9 +52,18 @@ class Sam:
         canvas = np.zeros((*self.model.canvas, 3), np.float32)
         canvas[: self.inner[0], : self.inner[1]] = 255 * small if self.model.raw else (small - MEAN) / DEVIATION
         self.model.look(canvas)
+        progress(1.0, "Looking at the photo")
 
-    def select(self, clicks: list[Click] = (), box: tuple[float, float, float, float] | None = None) -> np.ndarray:
-        """(H, W) bool: the mask of clicks together and a box (left, top, right, bottom) in px of the photo."""
+    def select(
+        self,
+        clicks: list[Click] = (),
+        tolerance: float = 0.5,
+        box: tuple[float, float, float, float] | None = None,
+    ) -> np.ndarray:
+        """(H, W) bool: the mask of clicks together and a box (left, top, right, bottom) in px of the photo.
+
+        tolerance 0 to 1: how unsure the model may be of a pixel; 0.5 is its own border.
+        """
         if not clicks and box is None:
             return np.zeros(self.shape, bool)
         points = np.array([self._placed(click.x, click.y) for click in clicks], np.float32).reshape(1, -1, 2)
@@ -58,7 +71,7 @@ class Sam:
         if box is not None:
             box = np.array([*self._placed(*box[:2]), *self._placed(*box[2:])], np.float32)
         logits, scores = self.model.masks(points, labels, box)
-        return self._full(logits[0, int(scores[0].argmax())]) > 0
+        return self._full(logits[0, int(scores[0].argmax())]) > SURENESS * (0.5 - tolerance)
 
     def everything(self, progress: Callable[[float, str], None]) -> list[np.ndarray]:
         """(H, W) bool masks, disjoint, by decreasing area: what a grid of points finds, small ones over large ones."""

@@ -194,3 +194,33 @@ def test_pick_selects_the_clicked_half(settings, regions):
     assert not pick.select(image, [(40, 40, True), (40, 80, False)], 0.5)[80, 40]
     assert len(pick._features) == 1
     pick.forget()
+
+
+def test_pick_by_weights_of_the_preferences_gets_clicks_and_box_in_px_of_what_it_saw(settings, monkeypatch):
+    """A photo that was reduced for the model: what is clicked and dragged on the large one has to be scaled."""
+    from material_palette.core import segmentation
+    from material_palette.operators import pick
+
+    seen = []
+
+    class Model:
+        takes_box = True
+        shape = (48, 80)
+
+        def look(self, pixels):
+            seen.append(pixels.shape)
+
+        def select(self, clicks, tolerance, box=None):
+            seen.append(([(click.x, click.y, click.positive) for click in clicks], tolerance, box))
+            mask = np.zeros(self.shape, bool)
+            mask[:, :40] = True
+            return mask
+
+    monkeypatch.setattr(segmentation, "picker", lambda weights: seen.append(weights) or Model())
+    image = bpy.data.images.new("large", 160, 96)
+    mask = pick.select(image, [(40, 20, True), (150, 90, False)], 0.3, "/weights", box=(10, 20, 100, 90))
+    assert seen == ["/weights", (96, 160, 3), ([(20, 10, True), (75, 45, False)], 0.3, (5, 10, 50, 45))]
+    assert mask.shape == (96, 160) and mask[:, :80].all() and not mask[:, 80:].any()
+    pick.select(image, [(40, 20, True)], 0.3, "/weights")
+    assert seen[-1][2] is None and len(seen) == 4  # looked at once
+    pick.forget()
