@@ -112,3 +112,15 @@ def test_white_balance_makes_the_regions_mean_grey_and_nothing_else():
     assert np.ptp(off.pixels[off.mask].mean(0)) > 0.05
     assert np.ptp(region.pixels[region.mask].mean(0)) < 0.002
     assert np.allclose(region.pixels * region.shading, photo, rtol=1e-4)
+
+
+def test_a_blurred_region_and_a_dark_one_are_said():
+    random = np.random.default_rng(0)
+    stones = random.random((20, 20, 3)).astype(np.float32).repeat(8, 0).repeat(8, 1)
+    sharp = linear_from_srgb(0.3 + 0.5 * stones)
+    soft = cv2.GaussianBlur(sharp, (0, 0), 4.0)
+    mask = np.zeros((160, 160), bool)
+    mask[:, 20:150] = True
+    assert not cut_exemplar(sharp, mask).warnings
+    assert any("out of focus" in warning for warning in cut_exemplar(soft, mask).warnings)
+    assert any("very dark" in warning for warning in cut_exemplar(sharp / 100, mask).warnings)
