@@ -36,7 +36,6 @@ CONCEPT_VERSION = 1
 PREVIEW = 256  # px
 LEAST_FITTED = 16  # px
 TEXELS_PER_PIXEL = 2.0  # of a picture, where a scene is known: renderers blur between texels
-FITTED_VISIBLE = 0.02  # FLIP that reducing may add then
 EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
@@ -368,9 +367,7 @@ def fit_material(material: Material, texels: float, progress: Progress, displace
     side = max(LEAST_FITTED, 8 * math.ceil(texels * TEXELS_PER_PIXEL / 8))
     with _timed(material.seconds, "fit"):
         shrunk = reduction.shrink(full, side)
-        found = (
-            reduction.Reduction(shrunk) if displaced else reduction.reduce(shrunk, progress, FITTED_VISIBLE, parts=1)
-        )
+        found = reduction.Reduction(shrunk) if displaced else reduction.reduce(shrunk, progress, parts=1)
         before, after = (reduction.texture_bytes(reduction.maps_of(x), found.bits) for x in (full, shrunk))
         if reduction.largest(full) > side:
             change = {"map": "all", "change": f"{side} px are seen", "bytes": before - after, "flip": 0.0}

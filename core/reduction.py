@@ -27,7 +27,7 @@ from .image import linear_from_srgb, srgb_from_linear
 from .material import SVBRDF
 from .torus import frequencies, resize
 
-VISIBLE = 0.05  # FLIP, mean over a window
+VISIBLE = 0.02  # FLIP, mean over a window
 WINDOW = 128  # px, two degrees of the view
 LEAST_SIDE = 16  # px
 MOST_PARTS = 4
