@@ -12,7 +12,6 @@ The names are those the code gives; no checkpoint was at hand to confirm them, s
 Neither weights nor code of the authors are included.
 """
 
-import pickle
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
@@ -26,8 +25,8 @@ from torch import nn
 from ..core.errors import PaletteError
 from ..core.image import srgb_from_linear
 from ..core.material import SVBRDF
-from ..core.tensors import read_tensors
 from ..core.torus import integrate, normal_from_height
+from .published import differences, read_state
 
 BLOCKS = (3, 4, 23, 3)
 WIDTHS = (16, 32, 64, 128, 256)  # of the decoder, from full resolution down
@@ -139,36 +138,20 @@ def load(path: Path) -> Resnet101:
     Raises PaletteError where the file cannot be read without running code from it, or is of another network.
     """
     path = Path(path)
-    if path.suffix == ".safetensors":
-        state = {name: torch.from_numpy(np.array(x)) for name, x in read_tensors(path)[0].items()}
-    else:
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except OSError as error:
-            raise PaletteError(f"can't read the checkpoint '{path}': {error.strerror or error}") from error
-        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-            raise PaletteError(
-                f"'{path}' holds more than tensors, or is no checkpoint; it is not opened, as that could run code from "
-                "it. If you trust it, save its 'state_dict' alone with torch.save, and choose that file"
-            ) from error
-        state = state.get("state_dict", state) if isinstance(state, dict) else {}
+    try:
+        state = read_state(path)
+    except OSError as error:
+        raise PaletteError(f"can't read the checkpoint '{path}': {error.strerror or error}") from error
     with torch.device("meta"):
         net = Resnet101()
-    expected = {name: tuple(x.shape) for name, x in net.state_dict().items()}
     found = {
-        name: x.float()
-        for name, x in state.items()
-        if isinstance(x, torch.Tensor) and name.startswith("model.") and not name.startswith("model.0.encoder.fc.")
+        name: x for name, x in state.items() if name.startswith("model.") and not name.startswith("model.0.encoder.fc.")
     }
-    shapes = {name: tuple(x.shape) for name, x in found.items()}
-    if shapes != expected:
-        wrong = [f"{name} is missing" for name in expected.keys() - shapes.keys()]
-        wrong += [f"{name} is unknown" for name in shapes.keys() - expected.keys()]
-        both = expected.keys() & shapes.keys()
-        wrong += [f"{n} is {shapes[n]}, not {expected[n]}" for n in both if shapes[n] != expected[n]]
+    expected = net.state_dict()
+    if wrong := differences(found, expected):
         raise PaletteError(
             f"'{path}' is not Material Palette's decomposition network ({len(wrong)} of its {len(expected)} tensors "
-            f"differ: {'; '.join(sorted(wrong)[:3])}). Choose the model.ckpt that its authors publish"
+            f"differ: {'; '.join(wrong[:3])}). Choose the model.ckpt that its authors publish"
         )
     net.load_state_dict(found, assign=True)
     return net.eval().requires_grad_(False)

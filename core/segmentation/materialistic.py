@@ -4,7 +4,6 @@ It answers clicks: what is of the clicked material, wherever it lies. For region
 depth of what no region covers yet, until enough are found. Seconds per photo and click on a CPU.
 """
 
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import numpy as np
 from ..errors import PaletteError
 from ..image import srgb_from_linear
 from ..region import Region, check_region
-from ..tensors import read_tensors
 from .pick import Click
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
@@ -117,6 +115,7 @@ def _load(path: str | Path | None):
     import torch
 
     from ...models import materialistic
+    from ...models.published import differences, read_state
 
     if path is None:
         raise PaletteError(f"Segmentation 'materialistic' needs weights: name {WANTED} with --weights FILE.")
@@ -126,43 +125,24 @@ def _load(path: str | Path | None):
         if not files:
             raise PaletteError(f"'{path}' holds no .safetensors, .ckpt or .pth file. Name {WANTED}.")
         path = files[0]
-    if path.suffix == ".safetensors":
-        state = {name: torch.from_numpy(np.array(x)) for name, x in read_tensors(path)[0].items()}
-    else:
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except OSError as error:
-            raise PaletteError(f"'{path}' can't be read: {error.strerror or error}. Name {WANTED}.") from None
-        except (pickle.UnpicklingError, RuntimeError, EOFError):
-            raise PaletteError(
-                f"'{path}' holds more than tensors, or is no checkpoint; it is not opened, as that could run code from "
-                f"it. If you trust it, save its 'state_dict' alone with torch.save and choose that file."
-            ) from None
-    state = state.get("state_dict", state) if isinstance(state, dict) else {}
-    found = {
-        name.removeprefix("net.").removeprefix("module."): x.float()
-        for name, x in state.items()
-        if isinstance(x, torch.Tensor)
-    }
+    try:
+        state = read_state(path)
+    except OSError as error:
+        raise PaletteError(f"'{path}' can't be read: {error.strerror or error}. Name {WANTED}.") from None
+    found = {name.removeprefix("net.").removeprefix("module."): x for name, x in state.items()}
     try:
         with torch.device("meta"):
             net = materialistic.Materialistic(**_sizes(found))
     except (KeyError, ValueError, ZeroDivisionError):
         raise PaletteError(f"'{path}' is not Materialistic's network with ViT-B/8. Name {WANTED}.") from None
-    expected = {name: tuple(x.shape) for name, x in net.state_dict().items()}
-    shapes = {
-        name: tuple(x.shape) for name, x in found.items() if not name.startswith(("dino_model.head", "criterion"))
-    }
-    if shapes != expected:
-        wrong = [f"{name} is missing" for name in expected.keys() - shapes.keys()]
-        wrong += [f"{name} is unknown" for name in shapes.keys() - expected.keys()]
-        both = expected.keys() & shapes.keys()
-        wrong += [f"{n} is {shapes[n]}, not {expected[n]}" for n in both if shapes[n] != expected[n]]
+    expected = net.state_dict()
+    found = {name: x for name, x in found.items() if not name.startswith(("dino_model.head", "criterion"))}
+    if wrong := differences(found, expected):
         raise PaletteError(
             f"'{path}' is not Materialistic's network with ViT-B/8 ({len(wrong)} of its {len(expected)} tensors "
-            f"differ: {'; '.join(sorted(wrong)[:3])}). Name {WANTED}."
+            f"differ: {'; '.join(wrong[:3])}). Name {WANTED}."
         )
-    net.load_state_dict({name: found[name] for name in expected}, assign=True)
+    net.load_state_dict(found, assign=True)
     return net.eval().requires_grad_(False)
 
 
