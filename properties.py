@@ -23,6 +23,11 @@ ENGINES = (
     ("patch", "Patch", "Grow the texture from the region's own patches; needs no network and no GPU"),
     ("diffusion", "Diffusion", "Let Stable Diffusion learn the region; needs weights, packages and a GPU: Preferences"),
 )
+SEGMENTATIONS = (
+    ("auto", "Automatic", "By colour and texture, with what ships", "MOD_EXPLODE", 0),
+    ("sam", "Segment Anything", "Objects, by weights of yours: Pick With in the preferences", "OBJECT_DATA", 1),
+    ("materialistic", "Materialistic", "By weights of yours: Pick With in the preferences", "MATERIAL", 2),
+)
 WHITE_BALANCES = (
     ("off", "As in the Photo", "Keep the photo's own white balance"),
     ("region", "Grey on Average", "Take the light's colour from the region: for plaster, concrete and other greys"),
@@ -200,7 +205,10 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         name="Show Regions", default=True, description="Show the regions over the photo in the Image Editor"
     )
     auto_regions: IntProperty(
-        name="Regions", default=6, min=1, max=64, soft_max=16, description="The most regions Auto Segment makes"
+        name="Regions", default=6, min=1, max=32, soft_max=16, description="The most regions Auto Segment makes"
+    )
+    segmentation: EnumProperty(
+        name="Segmentation", items=SEGMENTATIONS, description="How Auto Segment tells materials apart"
     )
 
     engine: EnumProperty(name="Engine", items=ENGINES, description="How a region becomes a texture")

@@ -83,10 +83,11 @@ def render(albedo, normal, roughness, lights, intensity, view, metallic=0.0) -> 
     )
 
 
-def render_sphere(svbrdf, size: int = 256, tiles: float = 2.0) -> np.ndarray:
+def render_sphere(svbrdf, size: int = 256, tiles: float = 2.0, rotation: float = 0.0) -> np.ndarray:
     """Picture of a sphere of the material, (size, size, 4) float32 linear RGBA, lit by a key light and a soft sky.
 
-    tiles is how often the texture repeats across the sphere's visible half.
+    tiles is how often the texture repeats across the sphere's visible half; its coordinates are turned by `rotation`
+    radians, the directions that its normals hold are not.
     """
     axis = (torch.arange(size) + 0.5) / size * 2.2 - 1.1
     x, y = axis[None].expand(size, -1), -axis[:, None].expand(-1, size)
@@ -95,6 +96,7 @@ def render_sphere(svbrdf, size: int = 256, tiles: float = 2.0) -> np.ndarray:
     geometric = torch.stack([x, y, z], -1)
     longitude, latitude = torch.atan2(x, z), torch.asin(y.clamp(-1, 1))
     u, v = longitude / math.pi * tiles, -latitude / math.pi * tiles
+    u, v = math.cos(rotation) * u + math.sin(rotation) * v, math.cos(rotation) * v - math.sin(rotation) * u
 
     def look_up(value, channels):
         value = torch.as_tensor(np.asarray(value, np.float32))

@@ -76,7 +76,12 @@ def build_material(record, folder, *, pack, preview=None):
 
 
 def set_preview(material, preview):
-    """Give `material` the picture `preview`: (256, 256, 4) float32 sRGB-encoded RGBA in [0, 1], top row first."""
+    """Give `material` the picture `preview` of what it looks like now: (256, 256, 4) float32 sRGB-encoded RGBA in
+    [0, 1], top row first; None leaves the one it has."""
+    # beside the picture in the file, so that undo takes both back
+    material["preview_of"] = Controls(material).look()
+    if preview is None:
+        return
     preview = np.asarray(preview, np.float32)
     if preview.shape != (PREVIEW_SIZE, PREVIEW_SIZE, 4):
         raise PaletteError(f"a preview is {PREVIEW_SIZE} x {PREVIEW_SIZE} RGBA, not an array of shape {preview.shape}")
@@ -90,6 +95,11 @@ def set_preview(material, preview):
     # without its own small picture Blender renders one whenever a list shows the material
     slot.icon_size = icon.shape[1::-1]
     slot.icon_pixels_float.foreach_set(np.ascontiguousarray(icon).ravel())
+
+
+def preview_is_of(material, look):
+    """Whether the preview of `material` was made of it with this `Controls.look`."""
+    return list(material.get("preview_of", ())) == look
 
 
 def mark_asset(material, description, author="", licence=""):
@@ -167,6 +177,13 @@ class Controls:
     def set(self, values):
         for name, value in values.items():
             setattr(self, name, value)
+
+    def look(self):
+        """What can be seen of the adjustments on a preview, as a list of numbers."""
+        principled = self.node("principled")
+        adjusted = (self.rotation, self.strength, self.roughness_offset, self.hue, self.saturation, self.brightness)
+        constants = (*principled.inputs["Base Color"].default_value[:3], principled.inputs["Roughness"].default_value)
+        return [self.tile_size or 0.0, *adjusted, *constants]
 
     def reset(self):
         """Back to what was extracted."""

@@ -17,6 +17,7 @@ from . import (
     photo,
     pick,
     preferences,
+    preview,
     rectify,
     regions,
     segment,
@@ -60,7 +61,7 @@ def register():
 
 def unregister():
     background.stop()
-    for module in (background, history, examine, pick):
+    for module in (background, history, examine, preview, pick):
         module.forget()
     for name, function in _HANDLERS:
         getattr(bpy.app.handlers, name).remove(function)

@@ -111,27 +111,26 @@ class OverPhoto(NeedsPackages, NeedsPhoto):
             self.draw_marks()
 
 
+_SHAPES = (
+    ("LASSO", "Lasso", "Drag around the region"),
+    ("POLYGON", "Polygon", "Click the corners; a double click or Enter closes it"),
+    ("BOX", "Box", "Drag from corner to corner"),
+)
+
+
 class MATERIAL_PALETTE_OT_draw_region(OverPhoto, Operator):
     """Draw an outline over the photo; what is inside joins the active region, or leaves it with Ctrl held"""
 
     bl_idname = "material_palette.draw_region"
     bl_label = "Draw Region"
 
-    shape: EnumProperty(
-        name="Shape",
-        description="What is drawn",
-        items=(
-            ("LASSO", "Lasso", "Drag around the region"),
-            ("POLYGON", "Polygon", "Click the corners; a double click or Enter closes it"),
-            ("BOX", "Box", "Drag from corner to corner"),
-        ),
-    )
+    shape: EnumProperty(name="Shape", description="What is drawn", items=_SHAPES)
     new: BoolProperty(name="New Region", description="Make a new region of what is drawn", options={"SKIP_SAVE"})
 
     @classmethod
     def description(cls, context, properties):
-        item = cls.bl_rna.properties["shape"].enum_items[properties.shape] if hasattr(cls, "bl_rna") else None
-        return f"{item.description}. It joins the active region; with Ctrl it leaves it" if item else cls.__doc__
+        how = next(description for shape, _, description in _SHAPES if shape == properties.shape)
+        return f"{how}. What is inside joins the active region, with Ctrl it leaves it"
 
     @property
     def hint(self):

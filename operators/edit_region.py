@@ -200,6 +200,7 @@ class MATERIAL_PALETTE_MT_region(bpy.types.Menu):
         layout.operator("material_palette.import_masks", icon="IMPORT")
         layout.operator("material_palette.export_masks", icon="EXPORT")
         layout.separator()
+        layout.operator("material_palette.remove_region", icon="REMOVE")
         layout.operator("material_palette.remove_all_regions", icon="TRASH")
 
 

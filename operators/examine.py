@@ -151,7 +151,7 @@ def _look():
         del _stale[uid]
         _known[uid], thumbnail = examine(*masks[uid])
         _known[uid].icon = _icon(uid, thumbnail)
-        _redraw()
+        redraw_sidebars()
     return 0.05 if _stale else None
 
 
@@ -175,7 +175,7 @@ def _icon(uid, thumbnail):
     return slot.icon_id
 
 
-def _redraw():
+def redraw_sidebars():
     """The sidebars only: drawing the editor itself says that its mask may have changed."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:

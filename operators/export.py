@@ -92,12 +92,12 @@ class MATERIAL_PALETTE_OT_export(_ExportsPalette, Operator):
             export.write_materialx(folder / f"{name}.mtlx", name, listed, tile_size, rotation)
 
 
-def adjusted_maps(material):
+def adjusted_maps(material, most=None):
     """What a material of ours looks like: (maps, tile_size, rotation, relief in metres).
 
-    maps: "basecolor" (H, W, 3) linear or (3,), "normal" (H, W, 3) unit vectors or None, "roughness" (H, W) or float,
-    "metallic" float, "height" (H, W) in [0, 1] or None; adjustments are in them. Raises PaletteError for a material
-    that isn't ours.
+    most: px, the longest side of a map that is wanted, None for all there is. maps: "basecolor" (H, W, 3) linear or
+    (3,), "normal" (H, W, 3) unit vectors or None, "roughness" (H, W) or float, "metallic" float, "height" (H, W) in
+    [0, 1] or None; adjustments are in them. Raises PaletteError for a material that isn't ours.
     """
     from ..core.export import adjust_colour, adjust_normal
     from ..core.image import linear_from_srgb
@@ -110,7 +110,7 @@ def adjusted_maps(material):
 
     def picture(kind):
         node = controls.node(kind)
-        return _read(node.image) if node and node.image else None
+        return _read(node.image, most) if node and node.image else None
 
     colour = picture("basecolor")
     if colour is None:
@@ -131,21 +131,26 @@ def adjusted_maps(material):
         "normal": normal,
         "roughness": roughness,
         "metallic": float(principled.inputs["Metallic"].default_value),
-        "height": _read(height)[..., 0] if height is not None else None,
+        "height": _read(height, most)[..., 0] if height is not None else None,
     }
     tile_size = controls.tile_size
     relief = material.get("height_scale", 0.0) * (tile_size or 1.0) * controls.strength
     return maps, tile_size, controls.rotation, relief
 
 
-def _read(image):
-    """(H, W, 3) float32 as stored, top row first."""
+def _read(image, most=None):
+    """(H, W, 3) float32 as stored, top row first; averaged down to sides of at most `most` px."""
     width, height = image.size
     if not (width and height):
         raise PaletteError(f"Texture '{image.name}' has no pixels; is its file still there?")
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)
-    return np.ascontiguousarray(pixels.reshape(height, width, 4)[::-1, :, :3])
+    pixels = pixels.reshape(height, width, 4)[::-1, :, :3]
+    step = -(-max(width, height) // most) if most else 1
+    if step > 1:
+        rows, columns = height // step, width // step
+        pixels = pixels[: rows * step, : columns * step].reshape(rows, step, columns, step, 3).mean((1, 3))
+    return np.ascontiguousarray(pixels)
 
 
 _items = []  # Blender needs the strings of a dynamic enum to live on

@@ -90,8 +90,8 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
     )
     pick_weights: StringProperty(
         name="Pick With",
-        description="Weights for Pick Material: a folder of Segment Anything's or a file of Materialistic's; else "
-        "what ships",
+        description="Weights for Pick Material, and for Auto Segment where it is set to them: a folder of Segment "
+        "Anything's or a file of Materialistic's; else what ships",
         subtype="FILE_PATH",
     )
     author: StringProperty(name="Author", description="Written into the assets that are made")

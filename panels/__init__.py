@@ -1,8 +1,9 @@
-"""The sidebar tab "Palette" of the Image Editor and the 3D View, menus, and the regions drawn over the photo."""
+"""The sidebar tab "Palette" of the Image Editor and the 3D View, menus, a shelf of materials, and the regions over the
+photo."""
 
-from . import menus, overlay, sidebar
+from . import menus, overlay, shelf, sidebar
 
-_MODULES = (sidebar, menus, overlay)
+_MODULES = (sidebar, menus, shelf, overlay)
 
 
 def register():

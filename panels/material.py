@@ -3,6 +3,7 @@
 from bpy.types import Panel
 
 from ..core.nodes import Controls
+from ..operators import preview
 
 
 def draw_controls(layout, material):
@@ -51,6 +52,7 @@ class MATERIAL_PALETTE_PT_material(Panel):
         return material is not None and bool(Controls(material))
 
     def draw(self, context):
+        preview.follow(context.material)
         draw_controls(self.layout, context.material)
 
 

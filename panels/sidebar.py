@@ -3,7 +3,7 @@
 import bpy
 from bpy.types import Panel, UIList
 
-from ..operators import examine, history
+from ..operators import examine, history, preview
 from ..operators.background import duration, time_left
 from ..operators.palette import active_entry
 from ..operators.regions import painted_region
@@ -113,6 +113,7 @@ def _draw_tools(layout, settings):
     count = row.row(align=True)
     count.ui_units_x = 4.0
     count.prop(settings, "auto_regions", text="")
+    row.prop(settings, "segmentation", text="", icon_only=True)
 
 
 def _draw_painting(layout, settings):
@@ -223,6 +224,9 @@ class PalettePanel:
             layout.template_list(
                 "MATERIAL_PALETTE_UL_palette", "", settings, "palette", settings, "active_material", rows=3, maxrows=10
             )
+        for entry in settings.palette:
+            if entry.material is not None:
+                preview.follow(entry.material)
         entry = active_entry(settings)
         if entry is None:
             return
@@ -235,14 +239,17 @@ class PalettePanel:
             row.scale_y = 1.3
             row.operator("material_palette.assign")
             row.operator("material_palette.assign", text="Assign and Map").mapping = "UNMAPPED"
+            if context.space_data.type == "VIEW_3D":
+                shelf = {"text": "Shelf to Drag From", "icon": "ASSET_MANAGER", "toggle": True}
+                layout.prop(context.space_data, "show_region_asset_shelf", **shelf)
         else:
             _draw_text(layout, context, f"The material of '{entry.name}' was deleted", "ERROR")
             layout.operator("material_palette.delete_material", text="Remove from Palette", icon="TRASH")
         row = layout.row(align=True)
         row.operator("material_palette.vary", icon="FILE_REFRESH")
-        if entry.material is not None and entry.material.material_palette.concept:
-            row.operator("material_palette.resample", text="", icon="FULLSCREEN_ENTER")
         row.operator("material_palette.replace_material", text="Replace", icon="ARROW_LEFTRIGHT")
+        if entry.material is not None and entry.material.material_palette.concept:
+            layout.operator("material_palette.resample", icon="FULLSCREEN_ENTER")
         if entry.previous is not None:
             row = layout.row(align=True)
             row.operator("material_palette.compare", text="Compare", icon="UV_SYNC_SELECT")

@@ -613,13 +613,46 @@ def test_a_result_for_a_removed_scene_is_thrown_away(ready, instant, data_blocks
 
 def test_segment_replaces_what_it_found_before_and_keeps_the_rest(ready):
     ready.auto_regions = 3
+    ready.active_region = 1
+    bpy.ops.material_palette.remove_region()
     assert bpy.ops.material_palette.segment() == {"FINISHED"}
-    found = [region.name for region in ready.regions][2:]
-    assert [region.name for region in ready.regions][:2] == ["left", "right"]
+    found = [region.name for region in ready.regions][1:]
+    assert ready.regions[0].name == "left"
     assert 1 <= len(found) <= 3
     assert all(tuple(region.mask.size) == (160, 96) for region in ready.regions)
     assert bpy.ops.material_palette.segment() == {"FINISHED"}
-    assert [region.name for region in ready.regions] == ["left", "right", *found]
+    assert [region.name for region in ready.regions] == ["left", *found]
+
+
+def test_segment_leaves_out_what_is_the_artists_already(ready, monkeypatch, capfd):
+    """Here the photo is seen at half its size, as a huge one is."""
+    from material_palette.core import segmentation
+    from material_palette.core.region import Region
+    from material_palette.operators.regions import read_mask_image
+
+    bpy.ops.material_palette.remove_region()
+    (own,) = ready.regions
+    mine = read_mask_image(own)
+    same, other = mine[::2, ::2].copy(), ~mine[::2, ::2]
+    same[:4] = True  # most of it is painted already
+    other[-8:] = True  # some of it is
+
+    def segment(pixels, engine, count, seed, progress, warn, weights):
+        warn("The sky is left out")
+        return [Region("region_1", same), Region("region_2", other)]
+
+    monkeypatch.setattr(segmentation, "segment", segment)
+    assert bpy.ops.material_palette.segment() == {"FINISHED"}
+    assert [region.name for region in ready.regions] == [own.name, "region_2"]
+    found = read_mask_image(ready.regions[1])
+    assert found.shape == mine.shape and (read_mask_image(own) == mine).all()
+    assert not (found & mine).any() and found[~mine].mean() > 0.95
+    assert "1 regions found, 1 are yours already. The sky is left out" in capfd.readouterr().out
+
+
+def test_segment_by_weights_says_which_it_needs(ready):
+    ready.segmentation = "sam"
+    assert "Pick With" in refused(bpy.ops.material_palette.segment)
 
 
 def add_object(name, content):

@@ -146,7 +146,7 @@ def draw(settings):
             window_manager=bpy.context.window_manager,
             preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)),
             region=SimpleNamespace(width=300),
-            space_data=SimpleNamespace(type="VIEW_3D"),
+            space_data=SimpleNamespace(type="VIEW_3D", bl_rna=bpy.types.SpaceView3D.bl_rna),
         )
         for section in sidebar._SECTIONS:
             if not hasattr(section, "poll") or section.poll(context):

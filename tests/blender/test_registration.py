@@ -2,6 +2,7 @@
 
 import gc
 import sys
+from types import SimpleNamespace
 
 import bpy
 import pytest
@@ -81,13 +82,45 @@ def test_every_operator_and_setting_says_what_it_does(extension):
                 assert said or prop.identifier in {"running", "progress", "message"}, (group, prop.identifier)
 
 
+def test_search_finds_every_verb(extension):
+    """Blender's search looks through menus: each operator of the artist's stands in one, or is the panel's alone."""
+    from material_palette.panels import menus
+
+    listed = set()
+
+    class Layout:
+        def operator(self, idname, *_, **_more):
+            listed.add(idname)
+            return self
+
+        operator_menu_enum = operator
+
+        def menu(self, idname, **_):
+            getattr(bpy.types, idname).draw(SimpleNamespace(layout=self), bpy.context)
+
+        def separator(self):
+            pass
+
+    for menu in (menus.MATERIAL_PALETTE_MT_image, menus.MATERIAL_PALETTE_MT_object):
+        menu.draw(SimpleNamespace(layout=Layout()), bpy.context)
+    verbs = {
+        cls.bl_idname
+        for cls in bpy.types.Operator.__subclasses__()
+        if cls.__name__.startswith("MATERIAL_PALETTE_OT_") and "INTERNAL" not in getattr(cls, "bl_options", ())
+    }
+    assert len(verbs) > 30
+    assert verbs - listed <= {"material_palette.copy_install_command"}
+
+
 def test_choices_are_those_of_the_pipeline(extension):
     pytest.importorskip("torch")
     from material_palette import properties
-    from material_palette.core import engines, palette
+    from material_palette.core import engines, palette, segmentation
 
     assert {identifier for identifier, *_ in properties.ENGINES} == set(engines.ENGINES)
-
+    assert {identifier for identifier, *_ in properties.SEGMENTATIONS} == set(segmentation.SEGMENTERS)
+    most = properties.MATERIAL_PALETTE_PG_settings.bl_rna.properties["auto_regions"].hard_max
+    assert most == segmentation.MOST_REGIONS
     assert tuple(identifier for identifier, *_ in properties.QUALITIES) == tuple(palette.QUALITIES)
     assert tuple(identifier for identifier, *_ in properties.WHITE_BALANCES) == palette.WHITE_BALANCES
     assert tuple(properties.RESOLUTION_RANGE) == tuple(palette.RESOLUTION_RANGE)

@@ -91,6 +91,21 @@ def story():
     assert run().error == "" and len(scene.material_palette.palette) == 1
     assert_nothing_left()
 
+    # a render that goes on in the background while materials are put into the file; the clicks outside end it
+    yield from begin()
+    scene.render.engine, scene.render.resolution_percentage = "CYCLES", 10
+    scene.cycles.samples, scene.cycles.use_adaptive_sampling = 2**20, False
+    bpy.context.preferences.view.render_display_type = "NONE"
+    with in_view():
+        assert bpy.ops.render.render("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield from wait(lambda: not run().running, 300)
+    assert run().error == "" and len(scene.material_palette.palette) == 1
+    assert bpy.app.is_job_running("RENDER")
+    open(STATE + ".esc", "w").close()
+    yield from wait(lambda: not bpy.app.is_job_running("RENDER"), 60)
+    os.remove(STATE + ".esc")
+    assert_nothing_left()
+
     yield from begin()
     bpy.ops.wm.open_mainfile(filepath=STATE + ".blend")
     yield from pause(1)
@@ -126,6 +141,8 @@ def story():
     yield from pause(1)
     assert run().running
     bpy.ops.wm.quit_blender()
+    while True:  # it ends when it comes round to it
+        yield
 
 
 def play(scene=story()):  # noqa: B008, one story per run of the script

@@ -6,6 +6,7 @@ for ((i = 0; i < 900 * ${PALETTE_PATIENCE:-1}; i++)); do
   [ ! -e "$PALETTE_STATE" ] || break
   alive || { echo "Blender ended early" >&2; return 1; }
   xdo mousemove $((x + w / 4 + i % 2 * 20)) $((y + h / 2))
+  [ ! -e "$PALETTE_STATE.esc" ] || key Escape
   sleep 0.5
 done
 python3 - "$PALETTE_STATE" <<'PY'

@@ -17,11 +17,16 @@ example=${PALETTE_EXAMPLE:-$(cd "$here/../../examples/facade" && pwd)}
 mkdir -p "$(dirname "$2")"
 out=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")
 export PALETTE_PHOTO="$example/photo.jpg" PALETTE_MASKS="$example/masks" PALETTE_SHOT=$out PALETTE_STATE="$out.state.json"
-rm -f "$PALETTE_STATE"
+rm -f "$PALETTE_STATE" "$PALETTE_STATE.esc"
 export BGUI_PASS="PALETTE_PHOTO PALETTE_MASKS PALETTE_STATE PALETTE_PATIENCE" BGUI_SHARE="$here:$example:$(dirname "$out")"
-if [ "$name" != interrupt ]; then
-  GUI_DRIVE="$here/$name.sh" exec "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out"
+code=0
+GUI_DRIVE="$here/$name.sh" "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out" 2>&1 | tee "$out.txt" || code=$?
+if [ "$name" = interrupt ]; then
+  # this story ends with the end of Blender, which the driver reports with its exit code
+  grep -q "Blender ended before the screenshot, code 0" "$out.txt" && ! grep -q "drive file failed" "$out.txt" && code=0
 fi
-# this story ends with the end of Blender, which the driver reports with its exit code
-GUI_DRIVE="$here/$name.sh" "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out" 2>&1 | tee "$out.txt" || true
-grep -q "Blender ended before the screenshot, code 0" "$out.txt"
+if grep -q "^Traceback" "$out.log"; then
+  sed -n '/^Traceback/,$p' "$out.log" >&2
+  exit 1
+fi
+exit "$code"
