@@ -87,11 +87,13 @@ def scenes(data: Path) -> list[Truth]:
 def photos(data: Path, file: Path = LABELS) -> list[Truth]:
     """Real photos of the data folder of which some patches are labelled by hand in `file`, in its order.
 
-    A patch is [left, top, right, bottom] in percent of the photo, well within a material. "sky" comes last
-    among the labels: it is no material to find, but should be in none.
+    They are named "photo_.." or "unseen_.." by their group: the second was labelled when all else was chosen. A patch
+    is [left, top, right, bottom] in percent of the photo, well within a material. "sky" comes last among the labels:
+    it is no material to find, but should be in none.
     """
     found = []
-    for name, materials in json.loads(file.read_text(encoding="utf-8")).items():
+    groups = json.loads(file.read_text(encoding="utf-8"))
+    for group, name, materials in ((group, *item) for group, named in groups.items() for item in named.items()):
         path = data / "photos" / f"{name}.jpg"
         if not path.exists():
             continue
@@ -102,7 +104,7 @@ def photos(data: Path, file: Path = LABELS) -> list[Truth]:
             for left, top, right, bottom in materials[material]:
                 rows = slice(int(top * height / 100), int(bottom * height / 100))
                 labels[rows, int(left * width / 100) : int(right * width / 100)] = index
-        found.append(Truth(name, pixels, labels, len(materials) - (SKY in materials)))
+        found.append(Truth(f"{group}_{name}", pixels, labels, len(materials) - (SKY in materials)))
     return found
 
 

@@ -7,9 +7,9 @@
 
 DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages are made of textures of the test split,
 which nothing was fitted on; no scene and none of its materials was either. Of real photos, patches are labelled by hand
-(photos.json): what is measured there is which patches are together, not where borders lie. Writes segmentation.csv, a
-row per measure, photo and method, as it goes (a second call goes on where the first ended), segmentation.json, the
-chart and sheet.jpg.
+(photos.json; those called unseen when all else was chosen): what is measured there is which patches are together, not
+where borders lie. Writes segmentation.csv, a row per measure, photo and method, as it goes (a second call goes on where
+the first ended), segmentation.json, the chart and sheet.jpg.
 """
 
 import argparse
@@ -43,6 +43,7 @@ from material_palette.core.segmentation.pick import Click, select  # noqa: E402
 COLLAGES = 12
 BOUND = 6  # the user's upper bound, as by default
 SHOWN = ("kodak_", "azure_")  # photos that may be shown
+KINDS = {"scene": "scenes", "collage": "collages", "photo": "real photos", "unseen": "real photos, unseen"}
 PARTS = ("photos", "auto", "stability", "pick", "time", "sheet")
 
 
@@ -56,7 +57,8 @@ def ours(pixels: np.ndarray, count: int) -> np.ndarray:
     return labels
 
 
-WHOLE = {"ours, auto": ours, **measures.WHOLE}
+OURS = "ours, auto"
+WHOLE = {OURS: ours, **measures.WHOLE}
 
 
 def changed(pixels: np.ndarray, truth: np.ndarray):
@@ -99,15 +101,20 @@ class Table:
         self.done.add((part, photo, method))
 
     def summary(self) -> dict:
+        """Median, quartiles and mean over photos, by part, kind of photo, method and measure."""
         found = defaultdict(list)
+        clean = {row[1]: float(row[4]) for row in self.rows if row[0] == "auto" and row[2:4] == (OURS, "iou")}
         for part, photo, method, measure, value in self.rows:
-            kind = {"time": photo, "photos": "photo"}.get(part, photo.split("_")[0])
+            kind = photo.split("_")[0]
             found[part, kind, method, measure].append(float(value))
+            if part == "stability" and clean.get(photo):
+                found[part, kind, method, "of clean"].append(float(value) / clean[photo])
         return {
             " | ".join(key): {
                 "median": round(float(np.median(values)), 4),
                 "quartiles": [round(float(q), 4) for q in np.quantile(values, (0.25, 0.75))],
                 "mean": round(float(np.mean(values)), 4),
+                "least": round(float(np.min(values)), 4),
                 "n": len(values),
             }
             for key, values in found.items()
@@ -120,14 +127,6 @@ def real_photos(table: Table, photos: list) -> None:
             if ("photos", photo.name, name) not in table.done and method is not measures.grabcut:
                 labels = method(photo.pixels, BOUND)
                 table.add("photos", photo.name, name, iou=measures.mean_iou(labels, photo.labels, photo.scored))
-                if method is ours:
-                    cv2.imwrite(str(_kept(table.path.parent, photo.name)), (labels + 1).astype(np.uint8))
-
-
-def _kept(folder: Path, name: str) -> Path:
-    """Where the regions of a photo are kept for the sheet; not a result."""
-    (folder / "regions").mkdir(exist_ok=True)
-    return folder / "regions" / f"{name}.png"
 
 
 def whole_photos(table: Table, photos: list) -> None:
@@ -220,8 +219,7 @@ def sheet(data: Path, folder: Path) -> None:
         if not path.name.startswith(SHOWN):
             continue
         pixels = read_photo(path).pixels
-        kept = _kept(folder, path.stem)
-        labels = cv2.imread(str(kept), cv2.IMREAD_GRAYSCALE).astype(int) - 1 if kept.exists() else ours(pixels, 0)
+        labels = ours(pixels, 0)
         image = np.round(255 * np.clip(srgb_from_linear(pixels), 0, 1)).astype(np.uint8)[..., ::-1]
         drawn = image // 4
         for index in range(labels.max() + 1):
@@ -241,10 +239,10 @@ def sheet(data: Path, folder: Path) -> None:
 
 
 def chart(table: Table, folder: Path) -> None:
-    """Mean IoU per method, on each kind of photo, and of clicks."""
+    """IoU per method, on each kind of photo, and of clicks."""
     panels = defaultdict(lambda: defaultdict(list))
     for part, photo, method, measure, value in table.rows:
-        kind = {"scene": "scenes", "collage": "collages"}.get(photo.split("_")[0], "real photos")
+        kind = KINDS.get(photo.split("_")[0])
         if part in ("photos", "auto") and measure == "iou":
             panels[f"{kind}: IoU"][method].append(float(value))
         elif part == "pick" and measure in ("iou_1", "iou_3") and "best" not in method:

@@ -34,8 +34,8 @@ def test_labelled_patches_of_photos_have_the_sky_last(tmp_path):
     (tmp_path / "photos").mkdir()
     cv2.imwrite(str(tmp_path / "photos" / "house.jpg"), np.full((100, 200, 3), 90, np.uint8))
     labels = {"house": {"sky": [[0, 0, 100, 10]], "wall": [[10, 50, 20, 100]]}, "absent": {"wall": [[0, 0, 9, 9]]}}
-    (tmp_path / "labels.json").write_text(json.dumps(labels))
+    (tmp_path / "labels.json").write_text(json.dumps({"photo": labels}))
     (photo,) = photos(tmp_path, tmp_path / "labels.json")
-    assert photo.name == "house" and photo.scored == 1
+    assert photo.name == "photo_house" and photo.scored == 1
     assert (photo.labels[:10] == 1).all() and (photo.labels[50:, 20:40] == 0).all()
     assert (photo.labels >= 0).sum() == 10 * 200 + 50 * 20

@@ -97,6 +97,42 @@ def test_a_painted_wall_of_a_real_photo_is_found_better_than_by_colour():
     assert best_iou(segment(pixels), wall) > opponent + 0.1
 
 
+def sky():
+    """Blue, brighter below, with a soft white cloud."""
+    blue = np.array((0.13, 0.32, 0.72), np.float32) * np.linspace(0.8, 1.2, 140, dtype=np.float32)[:, None, None]
+    cloud = np.zeros((140, 480), np.float32)
+    cv2.ellipse(cloud, (240, 70), (90, 30), 0, 0, 360, 1.0, -1)
+    cloud = cv2.GaussianBlur(cloud, (0, 0), 12)[..., None]
+    return blue * (1 - cloud) + 0.8 * cloud
+
+
+def soft():
+    """Something green far out of focus."""
+    y, x = np.mgrid[:140, :480].astype(np.float32) / 6.5
+    return coloured(0.5 + 0.3 * np.sin(x) * np.sin(y) + 0.1 * np.sin(0.7 * x + y), (0.2, 0.7, 0.3))
+
+
+WHITE = np.ones((140, 480, 3), np.float32)
+
+
+@pytest.mark.parametrize(("other", "word"), [(sky(), "sky"), (WHITE, "overexposed"), (soft(), "out of focus")])
+def test_what_is_no_surface_is_said_and_takes_none_of_the_number(scene, other, word):
+    pixels, masks = scene
+    words = []
+    regions = segment(np.concatenate([other, pixels]), regions=3, warn=words.append)
+    (text,) = words
+    assert word in text and "28%" in text
+    for name, mask in masks.items():
+        assert best_iou(regions, np.pad(mask, ((140, 0), (0, 0)))) > 0.85, name
+
+
+def test_a_photo_of_sky_or_of_blur_alone_is_a_region_all_the_same(scene):
+    for pixels in (sky()[:, :120], soft(), cv2.GaussianBlur(scene[0], (0, 0), 4)):
+        words = []
+        regions = segment(pixels, warn=words.append)
+        assert sum(region.mask.mean() for region in regions) > 0.8 and not words
+
+
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_regions_are_few_disjoint_ordered_and_large_enough(scene, count):
     regions = segment(scene[0], regions=count)

@@ -10,7 +10,8 @@
 3. Merge any two, wherever they lie, by the squared distance of their mean vectors and the same size term, so that
    islands of one material become one region. It goes on below the user's bound while two are as near as parts of one
    material are: vectors have deviation 1 along each direction within a material, so that limit is one number.
-4. What holds no texture of a surface is left out and said: too thin, blue sky, overexposed.
+4. What holds no texture of a surface is left out and said, and takes none of the N: blue sky with its clouds, before 3,
+   so that no wall merges with a cloud; overexposed or out of focus, after it; at last what is too thin.
 """
 
 import heapq
@@ -33,7 +34,11 @@ LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and 
 CLIPPED = 99.5  # of L: white, all three channels at their end
 CLIPPED_SHARE = 0.75  # of a region; what has more than a quarter of its pixels left holds a texture
 SKY_BLUE = 8.0  # -b
-SMOOTH = -3.6  # logarithm of a band's contrast; below it there is nothing but the camera's noise
+SKY_LIGHTNESS = 40.0  # of L
+SKY_EDGE = 0.15  # of the photo's upper edge
+SMOOTH, CLOUDY = -4.2, -3.6  # logarithm of the finest band's contrast; there is little but the camera's noise
+CONTRAST, CONTRAST_SHARE = -3.5, 0.15  # of the band of 4 px; the share of a region that must have it to tell its focus
+BLURRED = -1.4  # logarithm of the finest band's contrast over that of 4 px, in the upper quartile of those
 
 
 def segment_auto(
@@ -50,46 +55,61 @@ def segment_auto(
     photo, and, with a word to `warn`, those too thin to hold a texture and those that are no surface.
     """
     features = describe(pixels, lambda fraction, message: progress(0.6 * fraction, "Segmenting"))
-    owner = merged(features, regions, lambda fraction: progress(0.6 + 0.29 * fraction, "Segmenting"))
-    reasons = {region: _no_surface(features, owner == region) for region in range(owner.max() + 1)}
+    parts = _connected(
+        features, max(TOUCHING_UNTIL, regions), lambda fraction: progress(0.6 + 0.27 * fraction, "Segmenting")
+    )
+    owner, left_out = surfaces_of(features, parts, regions)
+    count = owner.max() + 1
+    for number, inside in enumerate(left_out.values(), count):
+        owner[inside[parts]] = number
     found = []
     for fraction, region, mask in _masks(owner[features.labels], pixels.shape[:2], progress):
         progress(0.94 + 0.05 * fraction, "Segmenting")
-        reason = reasons[region]
-        try:
-            check_region(Region("region", mask))
-        except PaletteError:
-            reason = "is too thin to hold a texture"
-        found.append((mask, reason))
-    surfaces = [mask for mask, reason in found if reason is None]
-    if not surfaces:  # a photo of nothing else: the user asked for its regions all the same
-        surfaces = [mask for mask, reason in found if reason != "is too thin to hold a texture"]
-    else:
-        for mask, reason in found:
-            if reason:
-                rows, columns = np.nonzero(mask)
-                where = f"around ({np.median(columns):.0f}, {np.median(rows):.0f}) px, {mask.mean():.0%} of the photo,"
-                warn(f"A region {where} {reason} and is left out. Paint it to have it.")
-    surfaces.sort(key=np.count_nonzero, reverse=True)
+        reason = None
+        if region >= count:
+            reason = list(left_out)[region - count]
+        else:
+            try:
+                check_region(Region("region", mask))
+                found.append(mask)
+            except PaletteError:
+                reason = "is too thin to hold a texture"
+        if reason and mask.mean() >= LEAST_SHARE:
+            rows, columns = np.nonzero(mask)
+            where = f"around ({np.median(columns):.0f}, {np.median(rows):.0f}) px, {mask.mean():.0%} of the photo,"
+            warn(f"A region {where} {reason} and is left out. Paint it to have it.")
+    found.sort(key=np.count_nonzero, reverse=True)
     progress(1.0, "Segmenting")
-    return [Region(f"region_{number}", mask) for number, mask in enumerate(surfaces[:regions], 1)]
+    return [Region(f"region_{number}", mask) for number, mask in enumerate(found, 1)]
 
 
-def merged(features: Features, regions: int, progress: Callable[[float], None]) -> np.ndarray:
-    """(n,) region of every superpixel, 0.. or -1: merged until at most `regions` hold LEAST_SHARE of the photo."""
-    histograms, weights = _histograms(features.lab, features.labels, lambda fraction: progress(0.3 * fraction))
-    owner = _merged_neighbours(
-        histograms,
-        weights,
-        features,
-        max(TOUCHING_UNTIL, regions),
-        lambda fraction: progress(0.3 + 0.6 * fraction),
-    )
-    count = owner.max() + 1
+def surfaces_of(features: Features, parts: np.ndarray, regions: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """(n,) region 0.. or -1 of every superpixel, and by reason the (parts,) bool that are left out."""
+    left_out = {"looks like sky": _sky(features, parts)}
+    surfaces = ~left_out["looks like sky"]
+    if features.size[surfaces[parts]].sum() < LEAST_SHARE * features.size.sum():
+        left_out, surfaces = {}, np.ones_like(surfaces)  # there is nothing else, and the user asked for regions
+    while True:
+        owner = merged(features, parts, surfaces, regions)
+        bad = _no_textures(features, parts, owner)
+        kept = surfaces & ~np.any(list(bad.values()), 0)
+        if not bad or features.size[kept[parts]].sum() < LEAST_SHARE * features.size.sum():
+            return owner, left_out
+        for reason, inside in bad.items():
+            left_out[reason] = left_out.get(reason, False) | inside
+        surfaces = kept
+
+
+def merged(features: Features, parts: np.ndarray, surfaces: np.ndarray, regions: int) -> np.ndarray:
+    """(n,) region 0.. or -1 of every superpixel: parts merged until at most `regions` hold LEAST_SHARE of the photo.
+
+    parts (n,) int: of every superpixel; surfaces (parts,) bool: the other parts are in no region.
+    """
+    owner, count = parts.copy(), len(surfaces)
     share = np.bincount(owner, features.size) / features.size.sum()
     weighted = features.vectors * features.size[:, None]
     mean = np.stack([np.bincount(owner, column) for column in weighted.T], 1) / features.size.sum() / share[:, None]
-    alive = np.ones(count, bool)
+    alive = surfaces.copy()
     while alive.sum() > 1:
         a, b = np.triu_indices(count, 1)
         both = alive[a] & alive[b]
@@ -106,11 +126,16 @@ def merged(features: Features, regions: int, progress: Callable[[float], None]) 
         share[a] += share[b]
         alive[b] = False
         owner[owner == b] = a
-        progress(1 - 0.1 * alive.sum() / count)
     kept = np.full(count, -1)
     large = np.flatnonzero(alive & (share >= LEAST_SHARE))
     kept[large] = np.arange(len(large))
     return kept[owner]
+
+
+def _connected(features: Features, until: int, progress: Callable[[float], None]) -> np.ndarray:
+    """(n,) part 0.. of every superpixel: neighbours merged until about `until` parts are left."""
+    histograms, weights = _histograms(features.lab, features.labels, lambda fraction: progress(0.3 * fraction))
+    return _merged_neighbours(histograms, weights, features, until, lambda fraction: progress(0.3 + 0.7 * fraction))
 
 
 def _histograms(
@@ -215,19 +240,54 @@ def _merged_neighbours(
     return np.unique(parent, return_inverse=True)[1]
 
 
-def _no_surface(features: Features, inside: np.ndarray) -> str | None:
-    """Why superpixels (n,) bool hold no texture of a surface, None when they do."""
-    size = features.size[inside]
-    pixels = features.lab[inside[features.labels]]
-    clipped = np.mean(pixels[:, 0] >= CLIPPED)
-    if clipped > CLIPPED_SHARE:
-        return f"is overexposed ({clipped:.0%} of it is plain white)"
-    bands = np.average(features.statistics[inside][:, BAND_COLUMNS], axis=0, weights=size)
-    top = inside[features.labels[0]].mean()
-    lightness, blueness = np.median(pixels[:, 0]), -np.median(pixels[:, 2])
-    if bands[0] < SMOOTH and top > 0.2 and blueness > SKY_BLUE and lightness > 50:  # a bright wall is no sky
-        return "looks like sky"
-    return None
+def _sky(features: Features, parts: np.ndarray) -> np.ndarray:
+    """(parts,) bool: blue, bright and smooth up to the photo's upper edge, and what is smooth and lies within it."""
+    count = parts.max() + 1
+    size = np.bincount(parts, features.size)
+    columns = [
+        features.statistics[:, 0] * 100,
+        features.statistics[:, 2] * 50,
+        features.statistics[:, BAND_COLUMNS][:, 0],
+    ]
+    lightness, b, detail = (np.bincount(parts, features.size * column) / size for column in columns)
+    edge = np.bincount(parts[features.labels[0]], minlength=count)
+    touching = np.zeros((count, count))
+    for one, other in ((0, 1), (1, 0)):
+        ends = parts[features.borders[:, one]], parts[features.borders[:, other]]
+        np.add.at(touching, ends, features.borders[:, 2])
+    np.fill_diagonal(touching, 0)
+    blue = (lightness > SKY_LIGHTNESS) & (b < -SKY_BLUE)
+    sky = blue & (detail < SMOOTH) & (edge > SKY_EDGE * edge.sum())
+    while sky.any():
+        beside = touching[:, sky].sum(1)
+        within = beside + edge > 0.5 * (touching.sum(1) + edge)
+        more = ~sky & (detail < CLOUDY) & (lightness > SKY_LIGHTNESS) & (beside > 0) & (blue | within)
+        if not more.any():
+            break
+        sky |= more
+    return sky
+
+
+def _no_textures(features: Features, parts: np.ndarray, owner: np.ndarray) -> dict[str, np.ndarray]:
+    """By reason the (parts,) bool that are of a region of owner (n,) without texture."""
+    count = owner.max() + 1
+    clipped = np.bincount(features.labels.ravel(), (features.lab[..., 0] >= CLIPPED).ravel()) / features.size
+    bands = features.statistics[:, BAND_COLUMNS]
+    contrast = bands[:, 2] > CONTRAST
+    blown, sharpness = np.zeros(len(owner), bool), np.full(count, np.nan)
+    for region in range(count):
+        inside = owner == region
+        if np.average(clipped[inside], weights=features.size[inside]) > CLIPPED_SHARE:
+            blown |= inside
+        if np.average(contrast[inside], weights=features.size[inside]) > CONTRAST_SHARE:
+            sharpness[region] = np.quantile((bands[:, 0] - bands[:, 2])[inside & contrast], 0.75)
+    soft = np.flatnonzero(sharpness < min(BLURRED, np.nanmax(sharpness, initial=-9) + BLURRED / 2))
+    white = np.bincount(parts, features.size * clipped) > 0.5 * np.bincount(parts, features.size)
+    found = {
+        "is overexposed (plain white)": white & (np.bincount(parts, blown) > 0),
+        "is out of focus": np.bincount(parts, np.isin(owner, soft)) > 0,
+    }
+    return {reason: inside for reason, inside in found.items() if inside.any()}
 
 
 def _masks(
