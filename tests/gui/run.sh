@@ -1,10 +1,10 @@
 #!/bin/bash
 # The extension in a real Blender window: the example photo, real clicks, what the data holds afterwards, screenshots.
 #
-#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [artist|interrupt|redraws]
+#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [artist|tools|interrupt|redraws]
 #
-# The story is a pair of files here: NAME.py runs in Blender, NAME.sh drives the window from outside.
-# artist, the default, also writes OUT-1-photo.png to OUT-9-assigned.png.
+# NAME.sh here drives the window from outside, NAME.py (or window.py) runs in Blender. artist, the default, goes from the
+# photo to assigned materials, tools tries what it leaves out; both also write OUT-STEP.png after their steps.
 # Exit code 0 when all went as expected. PALETTE_EXAMPLE: another folder with photo.jpg and masks/.
 # PALETTE_PATIENCE: a factor on all waits, for a busy machine (1).
 set -euo pipefail
@@ -19,8 +19,11 @@ out=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")
 export PALETTE_PHOTO="$example/photo.jpg" PALETTE_MASKS="$example/masks" PALETTE_SHOT=$out PALETTE_STATE="$out.state.json"
 rm -f "$PALETTE_STATE" "$PALETTE_STATE.esc"
 export BGUI_PASS="PALETTE_PHOTO PALETTE_MASKS PALETTE_STATE PALETTE_PATIENCE" BGUI_SHARE="$here:$example:$(dirname "$out")"
+export PALETTE_STORIES=$here
+script=$here/$name.py
+[ -e "$script" ] || script=$here/window.py
 code=0
-GUI_DRIVE="$here/$name.sh" "$BLENDER_GUI" gui "$1" "$here/$name.py" "$out" 2>&1 | tee "$out.txt" || code=$?
+GUI_DRIVE="$here/$name.sh" "$BLENDER_GUI" gui "$1" "$script" "$out" 2>&1 | tee "$out.txt" || code=$?
 if [ "$name" = interrupt ]; then
   # this story ends with the end of Blender, which the driver reports with its exit code
   grep -q "Blender ended before the screenshot, code 0" "$out.txt" && ! grep -q "drive file failed" "$out.txt" && code=0

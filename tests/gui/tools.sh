@@ -1,0 +1,112 @@
+# Sourced once the window is ready: what the artist's story leaves out, each tool once, with the mouse.
+. "$PALETTE_STORIES/window.sh"
+
+# spot NAME X Y: pixel of the screen at thousandths of the rectangle NAME of the state
+spot() { state "'%d %d' % (${1}[0] + ${1}[2] * $2 / 1000, ${1}[1] + ${1}[3] * $3 / 1000)"; }
+# carry X Y TO_X TO_Y: drag and drop on the screen
+carry() {
+  xdo mousemove "$1" "$2" sleep 0.5 mousedown 1 sleep 0.5 mousemove_relative 12 12 sleep 0.5
+  xdo mousemove $((($1 + $3) / 2)) $((($2 + $4) / 2)) sleep 0.5 mousemove "$3" "$4" sleep 1 mouseup 1
+}
+# the sidebar to its end
+scroll() {
+  xdo mousemove $(spot sidebar 400 700) sleep 0.5 click --repeat 40 --delay 40 5
+  sleep 2
+}
+# type TEXT into the field right of the label LABEL of the sidebar
+fill() {
+  local x y w h left
+  read -r left y <<<"$(find_text "$1" IMAGE_EDITOR UI)"
+  read -r x _ w h <<<"$(state "' '.join(map(str, sidebar))")"
+  xdo mousemove $((x + w * 2 / 3)) "$y" sleep 0.3 click --repeat 2 --delay 60 1 sleep 0.5
+  key ctrl+a
+  xdo type --delay 80 "$2"
+  key Return
+}
+
+# again_until CONDITION COMMAND...: what a busy machine has lost is done again
+again_until() {
+  local tries condition=$1
+  shift
+  for tries in 1 2; do
+    "$@"
+    if expect "$condition" 8 quietly; then return 0; fi
+  done
+  "$@"
+  expect "$condition" 15
+}
+
+# a photo dropped from Blender's file browser
+tell browse
+sleep 2
+at=$(find_text photo.jpg || find_text photo.ipg)
+carry $at $(spot editor 300 500)
+sleep 2
+picture drop
+key p # Blender asks: Open Images or Open Photo
+expect "photo == 'photo.jpg'" 15
+picture dropped
+echo "paste is offered: $(state pastes)"
+
+# corners by their handles, and a length; both end with Enter
+tell masks
+press Corners "'MATERIAL_PALETTE_OT_corners' in modal" 10
+sleep 1
+again_until "corners and abs(corners[0] - 0.100 * size[0]) < 4 and abs(corners[1] - 0.150 * size[1]) < 4" \
+  drag $(state "' '.join(map(str, handle))") 100 150
+key Return
+expect "not modal" 10
+press Measure "'MATERIAL_PALETTE_OT_measure' in modal" 10
+sleep 1
+again_until "measured and abs(measured[2] - 0.6 * size[0]) < 4 and abs(measured[3] - 0.32 * size[1]) < 4" drag 200 300 600 320
+key Return
+expect "not modal" 10
+picture corners
+
+# a region alone, made larger from what is kept of it
+tell clear
+read -r x y <<<"$(find_text 'Extract Palette' IMAGE_EDITOR UI)"
+again_until running click $((x + 110)) "$y"
+expect "not running and len(palette) == 1 and max(widths) == 64 and not error" 200
+tell larger
+scroll
+press Resample running 20
+expect "not running and len(palette) == 1 and max(widths) > 64 and not error" 200
+picture resampled
+
+# an adjustment is seen on the preview, and undone there
+scroll
+before=$(state seen)
+again_until "abs(brightness - 0.4) < 1e-3" fill Brightness 0.4
+expect "seen < 0.85 * $before" 30
+picture adjusted
+read -r x y <<<"$(spot editor 300 500)"
+xdo mousemove "$x" "$y" sleep 0.3
+key ctrl+z
+expect "brightness == 1 and abs(seen - $before) < 0.02" 30
+
+# the search finds what stands in menus
+key F3
+sleep 1
+xdo type --delay 80 "palette restore"
+sleep 2
+picture search
+key Return
+expect "resolution == 1024" 10
+
+# onto an object from the shelf, onto a face by a click
+tell look_at_objects
+sleep 2
+scroll
+press "Shelf to Drag From" shelf 20
+sleep 3
+picture shelf
+carry $(state "'%d %d' % (shelf[0] + 50, shelf[1] + shelf[3] / 2)") $(spot view 500 500)
+expect "cube == palette[0]" 15
+picture carried
+tell one_face
+scroll
+press Assign "slots == [None, palette[0]]" 10
+tell leave_edit_mode
+expect "faces == [0, 0, 1, 0, 0, 0]" 10
+picture face

@@ -1,0 +1,58 @@
+# What the stories share: how they wait for the data, find a button, and use the mouse over the photo.
+
+# expect CONDITION SECONDS [quietly]: wait until the Python expression CONDITION of the state is true.
+expect() {
+  local condition=$1 seconds=$(($2 * ${PALETTE_PATIENCE:-1})) quietly=${3:-} start=$SECONDS
+  while ! python3 - "$PALETTE_STATE" "$condition" <<'PY'
+import json, sys
+try:
+    state = json.load(open(sys.argv[1]))
+except OSError:
+    sys.exit(1)
+sys.exit(not eval(sys.argv[2], state))
+PY
+  do
+    if ! alive || ((SECONDS - start > seconds)); then
+      [ -z "$quietly" ] || return 1
+      echo "not within $seconds s: $condition" >&2
+      cat "$PALETTE_STATE" >&2
+      picture failed
+      return 1
+    fi
+    sleep 0.3
+  done
+  echo "$((SECONDS - start)) s: $condition"
+}
+state() { python3 -c 'import json, sys; print(eval(sys.argv[2], json.load(open(sys.argv[1]))))' "$PALETTE_STATE" "$1"; }
+picture() { sleep 2; shot "${PALETTE_SHOT%.png}-$1.png"; }
+tell() { echo "$1" >"$PALETTE_STATE.do"; expect "done and done[-1] == '$1'" 30; sleep 1; }
+# press TEXT CONDITION SECONDS: click on a button of the sidebar; a second time where a busy machine has lost the click
+press() {
+  local tries
+  for tries in 1 2; do
+    sleep 1
+    # the recognition of text now and then joins two words
+    click_text "$1" IMAGE_EDITOR UI 2>/dev/null || click_text "${1// /}" IMAGE_EDITOR UI
+    if expect "$2" "$((tries == 1 ? 8 : $3))" quietly; then return 0; fi
+  done
+  expect "$2" 1
+}
+# at X Y: pixel of the screen for a place in the photo, in thousandths of its width and height
+at() { python3 - "$PALETTE_STATE" "$1" "$2" <<'PY'
+import json, sys
+left, top, right, bottom = json.load(open(sys.argv[1]))["rectangle"]
+x, y = (int(v) / 1000 for v in sys.argv[2:])
+print(round(left + x * (right - left)), round(top + y * (bottom - top)))
+PY
+}
+# drag X Y X Y ...: the left button held from place to place of the photo
+drag() {
+  local held=0
+  while [ $# -ge 2 ]; do
+    xdo mousemove $(at "$1" "$2"); sleep 0.15
+    ((held)) || { xdo mousedown 1; sleep 0.15; held=1; }
+    shift 2
+  done
+  xdo mouseup 1
+  sleep 0.3
+}
