@@ -14,7 +14,7 @@ import argparse
 import csv
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -31,6 +31,7 @@ from material_palette.benchmarks.baselines import largest_square  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
 from material_palette.core import decomposition, palette, perceptual  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
+from material_palette.core.exemplar import LUMINANCE  # noqa: E402
 from material_palette.core.image import linear_from_srgb, srgb_from_linear  # noqa: E402
 from material_palette.core.material import SVBRDF  # noqa: E402
 from material_palette.core.region import Region  # noqa: E402
@@ -47,6 +48,7 @@ FOUND = 0.1  # IoU from which on an automatic region counts as a part's
 QUALITIES = ("draft", "balanced", "best")
 DECOMPOSERS = ("unet", "analytic")
 OURS = "ours, balanced, unet"
+GREY_CARD = ", exposure known"  # rows of which the photo's exposure is right in the mean of its parts
 AGAIN = (OURS, "ours, auto regions", "true class", "other class", "mean colour", "square crop")  # rendered again
 MEASURES = {
     "A": "albedo, ST-LPIPS",
@@ -261,6 +263,19 @@ def compare_pictures(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
     return row
 
 
+def add_exposed(row: str, answers: dict[str, dict[str, Found]], truth: dict[str, SVBRDF]) -> None:
+    """Add a row whose base colours have the factor, one for the scene, that makes them right in the mean of its parts:
+    what is left of the error when a grey card tells the exposure."""
+    parts = [part for part, found in answers.items() if row in found]
+    level = {part: float(mean_colour(answers[part][row].maps) @ LUMINANCE) for part in parts}
+    true = {part: float(mean_colour(truth[part]) @ LUMINANCE) for part in parts}
+    gain = np.exp(np.mean([np.log(max(true[part], 1e-3) / max(level[part], 1e-3)) for part in parts]))
+    for part in parts:
+        found = answers[part][row]
+        maps = replace(found.maps, albedo=np.clip(found.maps.albedo * np.float32(gain), 0, 1))
+        answers[part][row + GREY_CARD] = replace(found, maps=maps)
+
+
 def automatic(shown: scenes.Shown) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """By part the automatic region that fits it best, where one does, and all IoUs."""
     regions = segment(shown.photo, regions=6)
@@ -297,13 +312,16 @@ def run_scene(number: int, tested, every, options, keep: Path) -> dict:
         random = np.random.default_rng([number, i])
         found = rows_of(number, shown, part, across[part], parts[part], every, view, auto.get(part), options, random)
         answers[part] = found
+        print(f"  {part}: {parts[part].name}, {len(found)} rows", flush=True)
+    for row in (OURS, "square crop"):
+        add_exposed(row, answers, truth)
+    for i, (part, found) in enumerate(answers.items()):
         for row, answer in found.items():
             facts = {"scene": f"{number}_{kind}", "part": part, "material": parts[part].name, "row": row}
             facts |= compare(truth[part], across[part], answer, 1000 * number + i)
             facts |= {"cpu_seconds": answer.seconds, "pixels": int(shown.masks[part].sum())}
             facts |= {"auto_iou": ious.get(part), "warnings": "; ".join(answer.warnings)}
             result["parts"].append(facts)
-        print(f"  {part}: {parts[part].name}, {len(found)} rows", flush=True)
     share, samples = scenes.AGAIN
     original = scenes.exposed(scene.render(share, samples), shown.gain)
     small = original.shape[1], original.shape[0]

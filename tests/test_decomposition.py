@@ -48,6 +48,17 @@ def test_normal_is_the_gradient_of_the_height(texture, decomposer):
 
 
 @each
+def test_roughness_varies_a_little_and_less_where_there_is_little_to_see(texture, decomposer):
+    maps = decompose(texture, quiet, decomposer)
+    luminance = np.log(maps.albedo @ LUMINANCE + analytic.DARKEST)
+    assert np.corrcoef(maps.roughness.ravel(), luminance.ravel())[0, 1] < -0.95
+    assert maps.roughness.std() == pytest.approx(analytic.VARIATION, rel=0.02)
+    mean = texture.mean((0, 1))
+    faint = decompose((mean + 0.05 * (texture - mean)).astype(np.float32), quiet, decomposer)
+    assert faint.roughness.std() < analytic.VARIATION / 2
+
+
+@each
 def test_any_size(decomposer):
     texture = linear_from_srgb(tileable_noise(70, 33)[..., None].repeat(3, -1).astype(np.float32))
     maps = decompose(texture, quiet, decomposer)

@@ -1,8 +1,8 @@
 """Decomposer `analytic`: albedo, normal, roughness and height of an evenly lit, tileable texture, without training.
 
 Claim: gradients of luminance without a change of chromaticity are shading (colour Retinex); integrated on the torus
-they give the shading, and, dark being deep, the height. What one picture does not show is not made up: roughness is the
-prior, since no statistic of the texture predicted it better on materials outside the fit (`training/analytic.py`).
+they give the shading, and, dark being deep, the height. Mean roughness is the prior, since no statistic of the texture
+predicted it better on materials outside the fit (`training/analytic.py`).
 
 Sources: Land and McCann 1971, Grosse et al. 2009 (colour Retinex); Langer and Zucker 1994 (dark is deep);
 Frankot and Chellappa 1988 (integration).
@@ -22,9 +22,12 @@ CHROMA = 0.1  # change of log chromaticity per pixel at which a gradient counts 
 SHADING = 0.2  # share of the shading found that is taken out of the albedo
 RELIEF = 0.4  # slope per unit of log shading
 ROUGHNESS = 0.6
+VARIATION = 0.03  # deviation of roughness within a material: two thirds of the training materials' median
+LEAST_CONTRAST = 0.05  # deviation of log luminance; what varies less varies in roughness less
 # cycles per tile below which shading is no relief, but what is left of the illumination
 LONGEST = 3.0
 DARKEST = 0.02  # linear; keeps the logarithm of black finite
+LEAST_ROUGHNESS = 0.05
 
 
 def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SVBRDF:
@@ -39,7 +42,20 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SV
     progress(0.8, "computing normals")
     normal = normal_from_height(height)
     progress(1.0, "computing normals")
-    return SVBRDF(albedo.numpy(), normal.numpy(), ROUGHNESS, height.numpy())
+    return SVBRDF(albedo.numpy(), normal.numpy(), vary(ROUGHNESS, albedo).numpy(), height.numpy())
+
+
+def vary(mean: float, albedo: torch.Tensor) -> torch.Tensor:
+    """Roughness (H, W) about a mean: what is darker in the albedo (H, W, 3) is rougher.
+
+    In measured materials roughness follows the albedo's details (|r| = 0.5), in one half of them this way round, in the
+    other half the other, and no picture tells which. So the pattern is likely, its sign a convention (dirt and pores
+    are dark, worn edges bright), and it is weak, so that its squared error is hardly above that of none.
+    """
+    luminance = torch.log(albedo @ torch.from_numpy(LUMINANCE) + DARKEST)
+    luminance = luminance - luminance.mean()
+    varied = mean - VARIATION * luminance / luminance.std().clamp_min(LEAST_CONTRAST)
+    return varied.clamp(LEAST_ROUGHNESS, 1)
 
 
 def _shading(pixels: torch.Tensor) -> torch.Tensor:

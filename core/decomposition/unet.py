@@ -3,8 +3,8 @@
 A network with strides sees a texture differently after it is rolled by a pixel. So the texture is first rolled to an
 origin that its content decides, and the maps are rolled back: then rolling the texture rolls the maps, bit for bit.
 
-Roughness is the material's mean, a value: what the network says of its variation is no better than none on materials
-it was not trained on (`models/svbrdf_net.md`).
+The network tells the material's mean roughness: what it says of its variation is no better than none on materials it
+was not trained on (`models/svbrdf_net.md`), so that follows `analytic.vary`.
 """
 
 import os
@@ -23,6 +23,7 @@ from ..image import srgb_from_linear
 from ..material import SVBRDF
 from ..tensors import read_tensors
 from ..torus import integrate, normal_from_height
+from .analytic import LEAST_ROUGHNESS, vary
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "svbrdf_net.safetensors"
 TILE = 512, 1024  # px, rows and columns
@@ -30,6 +31,9 @@ HALO = 96  # px: what is farther away changes a pixel by less than a grey level 
 OVERVIEW = 256  # px: longer side of what the material is recognised in
 SAMPLE = 192  # px: side of each of at most four samples of which the light is read
 STEEPEST = 4.0
+# the network says what is likely on average, which is nearly flat where it is unsure; times this the relief of materials
+# it has not seen is half as steep as measured, and pictures of it under other lights are no farther off (FLIP)
+RELIEF = 4.0
 DARKEST = 1e-3  # linear, as in training
 FAINT = 0.03  # deviation of the encoded pixels below which there is ever less to see, and the network is believed less
 
@@ -45,17 +49,17 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weigh
         material, kind = net.recognise(_overview(encoded))
         whole = net.describe(_samples(encoded), material)
         out = _tiled(net, encoded, whole, progress)
-        mean = net.mean_roughness(kind).clamp(0.05, 1).item()
+        mean = net.mean_roughness(kind).clamp(LEAST_ROUGHNESS, 1).item()
     progress(0.8, "integrating the height")
     out *= min(1.0, float(encoded.std((0, 1)).max()) / FAINT)
-    gain, slope = out[..., :3], out[..., 3:].clamp(-STEEPEST, STEEPEST)
+    gain, slope = out[..., :3], (RELIEF * out[..., 3:]).clamp(-STEEPEST, STEEPEST)
     albedo = (torch.from_numpy(texture).clamp_min(DARKEST) * torch.exp(gain)).clamp(0, 1)
     height = integrate(slope[..., 0], slope[..., 1]) / texture.shape[1]
     progress(0.9, "computing normals")
-    maps = (albedo, normal_from_height(height), height)
-    albedo, normal, height = (x.roll(origin, (0, 1)).numpy() for x in maps)
+    maps = (albedo, normal_from_height(height), vary(mean, albedo), height)
+    maps = (x.roll(origin, (0, 1)).numpy() for x in maps)
     progress(1.0, "computing normals")
-    return SVBRDF(albedo, normal, mean, height)
+    return SVBRDF(*maps)
 
 
 @cache
