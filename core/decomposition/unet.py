@@ -31,8 +31,8 @@ HALO = 96  # px: what is farther away changes a pixel by less than a grey level 
 OVERVIEW = 256  # px: longer side of what the material is recognised in
 SAMPLE = 192  # px: side of each of at most four samples of which the light is read
 STEEPEST = 4.0
-# the network says what is likely on average, which is nearly flat where it is unsure; times this the relief of materials
-# it has not seen is half as steep as measured, and pictures of it under other lights are no farther off (FLIP)
+# the network says what is likely on average, which is nearly flat where it is unsure; times this the relief of
+# materials it has not seen is half as steep as measured, and pictures under other lights are no farther off (FLIP)
 RELIEF = 4.0
 DARKEST = 1e-3  # linear, as in training
 FAINT = 0.03  # deviation of the encoded pixels below which there is ever less to see, and the network is believed less
