@@ -100,7 +100,6 @@ def adjusted_maps(material, most=None):
     [0, 1] or None; adjustments are in them. Raises PaletteError for a material that isn't ours.
     """
     from ..core.export import adjust_colour, adjust_normal
-    from ..core.image import linear_from_srgb
     from ..core.nodes import Controls
 
     controls = Controls(material)
@@ -110,13 +109,13 @@ def adjusted_maps(material, most=None):
 
     def picture(kind):
         node = controls.node(kind)
-        return _read(node.image, most) if node and node.image else None
+        return read_map(node.image, most) if node and node.image else None
 
     colour = picture("basecolor")
     if colour is None:
         colour = np.array(principled.inputs["Base Color"].default_value[:3], np.float32)
     else:
-        colour = adjust_colour(linear_from_srgb(colour), controls.hue, controls.saturation, controls.brightness)
+        colour = adjust_colour(colour, controls.hue, controls.saturation, controls.brightness)
     normal = picture("normal")
     if normal is not None:
         normal = adjust_normal(normal * 2 - 1, controls.strength, controls.rotation)
@@ -131,21 +130,27 @@ def adjusted_maps(material, most=None):
         "normal": normal,
         "roughness": roughness,
         "metallic": float(principled.inputs["Metallic"].default_value),
-        "height": _read(height, most)[..., 0] if height is not None else None,
+        "height": read_map(height, most)[..., 0] if height is not None else None,
     }
     tile_size = controls.tile_size
     relief = material.get("height_scale", 0.0) * (tile_size or 1.0) * controls.strength
     return maps, tile_size, controls.rotation, relief
 
 
-def _read(image, most=None):
-    """(H, W, 3) float32 as stored, top row first; averaged down to sides of at most `most` px."""
+def read_map(image, most=None):
+    """(H, W, 3) float32, top row first: a base colour linear, other maps as stored; averaged down to sides of at most
+    `most` px."""
+    from ..core.image import linear_from_srgb
+
     width, height = image.size
     if not (width and height):
         raise PaletteError(f"Texture '{image.name}' has no pixels; is its file still there?")
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(height, width, 4)[::-1, :, :3]
+    # Blender has decoded those of more than 8 bits itself
+    if image.colorspace_settings.name == "sRGB" and not image.is_float:
+        pixels = linear_from_srgb(pixels)
     step = -(-max(width, height) // most) if most else 1
     if step > 1:
         rows, columns = height // step, width // step

@@ -12,7 +12,7 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from .background import BackgroundOperator
-from .export import _read
+from .export import read_map
 from .palette import adopt_adjustments, put_in_palette, take_place
 
 FITTED = "palette_fitted"  # custom property of a material that this has made
@@ -132,7 +132,6 @@ def _bytes(material):
 
 def _svbrdf(material):
     """The maps of a material of ours as they were extracted, without adjustments, and its metres per tile."""
-    from ..core.image import linear_from_srgb
     from ..core.material import SVBRDF
     from ..core.nodes import Controls
 
@@ -141,13 +140,11 @@ def _svbrdf(material):
 
     def picture(kind):
         node = controls.node(kind)
-        return _read(node.image) if node and node.image else None
+        return read_map(node.image) if node and node.image else None
 
     albedo, normal, roughness = (picture(kind) for kind in ("basecolor", "normal", "roughness"))
     if albedo is None:
         albedo = np.array(principled.inputs["Base Color"].default_value[:3], np.float32)
-    else:
-        albedo = linear_from_srgb(albedo)
     if normal is None:
         normal = np.array([0, 0, 1], np.float32)
     else:
@@ -156,7 +153,7 @@ def _svbrdf(material):
     roughness = float(principled.inputs["Roughness"].default_value) if roughness is None else roughness[..., 0].copy()
     height = material.get("height")
     if height is not None:
-        height = (_read(height)[..., 0] - material["height_midlevel"]) * material["height_scale"]
+        height = (read_map(height)[..., 0] - material["height_midlevel"]) * material["height_scale"]
     return SVBRDF(albedo, normal, roughness, height), float(material.get("metres_per_tile", 1.0))
 
 

@@ -38,6 +38,21 @@ def test_files_have_the_adjustments_in_them(stone, tmp_path):
     assert 'value="0.5, 0.5"' in (out / "stone" / "stone.mtlx").read_text()
 
 
+def test_a_base_colour_of_16_bits_is_the_same_colour(settings, tmp_path, make_record, write_maps):
+    from material_palette.operators.export import read_map
+
+    read = []
+    record = make_record(write_maps())
+    path = tmp_path / "stone" / "stone_basecolor.png"
+    encoded = cv2.imread(str(path))
+    for pixels in (encoded, encoded.astype(np.uint16) * 257):
+        cv2.imwrite(str(path), pixels)
+        material = nodes.build_material(record, tmp_path, pack=True)
+        read.append(read_map(nodes.Controls(material).node("basecolor").image))
+    np.testing.assert_allclose(read[0], read[1], atol=1e-4)
+    assert read[0].max() > 1.2 * read[0].mean()
+
+
 def test_a_material_taken_apart_is_refused_by_name(stone, tmp_path):
     stone.node_tree.nodes.clear()
     with pytest.raises(RuntimeError, match="'stone'"):
