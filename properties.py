@@ -234,6 +234,16 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         description="Keep what is learnt of each region in its material, so that Resample makes it larger or varies it "
         "without the photo. Adds about 6 bytes per pixel of the region to the file",
     )
+    target_error: FloatProperty(
+        name="Target Error",
+        min=0.0,
+        max=1.0,
+        soft_max=0.3,
+        step=1,
+        precision=3,
+        description="How far each texture may be from its region, such as 0.1: the cheapest quality predicted to meet "
+        "it is chosen region by region. 0: as Quality says",
+    )
     seed: IntProperty(name="Seed", min=0, description="The same seed gives the same textures, another one a variation")
     metres_per_tile: FloatProperty(
         name="Tile Size",

@@ -1,18 +1,21 @@
 #!/usr/bin/env python3
 """What a scene needs: textures, file, seconds and memory of full and of fitted palettes, and how pictures differ.
 
-    python3 dev.py bench needs --data DATA          # about 10 minutes of one core
+    python3 dev.py bench needs --data DATA          # about 15 minutes of one core
     python3 dev.py bench needs --quick              # one small scene, from the bundled photo
 
 Three scenes of `scenes.py`, each with the palette of the bundled photo as it is extracted with --full-maps, and with
 materials of DATA (CC0, test split, in their own size). Each is rendered by Cycles with the full palette and with it
-fitted to the scene at several texels per pixel; the product's own functions fit, write and build. Three suns light it,
-without bounces, and the middle of the picture is rendered well sampled, so that textures differ, not
-noise. Writes needs.csv, needs.json and the chart.
+fitted to the scene for several errors that may be made; the product's own functions fit, write and build. Three suns
+light it one after the other and together, without bounces, and a pixel is the mean of samples on a grid: pictures have
+no noise, so that what differs is the textures. Seconds and memory are those of a process that opens the file and
+renders it as a user would. Writes needs.csv, needs.json, the chart and the pictures.
 """
 
 import argparse
-import re
+import json
+import math
+import subprocess
 import sys
 import tempfile
 import time
@@ -34,12 +37,22 @@ from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_
 from material_palette.core.material import SVBRDF  # noqa: E402
 from material_palette.core.region import read_regions  # noqa: E402
 
-SIZE, SAMPLES = (960, 540), 48
+SIZE, GRID = (960, 540), 4  # samples along a pixel's side
 BORDER = (0.35, 0.65, 0.25, 0.55)  # what is rendered of the picture: from left to right and from below
+FILTER = 1.5  # px, width of Cycles' own pixel filter
 SUNS = (((0.6, 0.2, 0.4), 2.5), ((0.9, 0.0, -0.9), 1.2), ((0.3, -0.9, 0.0), 0.8))  # rotation, strength
-FACTORS = (1.0, 2.0)  # texels per pixel
+VISIBLE = (0.01, 0.02, 0.04)
 EXAMPLE = ROOT / "examples" / "viaduct"
-SHIPPED = f"fitted, {palette.TEXELS_PER_PIXEL:g} texel per pixel"
+SHIPPED = f"fitted, {reduction.VISIBLE:g}"
+COST_SAMPLES = 16
+# opens a .blend, renders it, and tells its CPU seconds and its peak memory in MB after loading and at the end
+RENDER = """
+import bpy, json, resource, sys, time
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+start = time.process_time()
+bpy.ops.render.render()
+print(json.dumps([time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024]))
+"""
 
 
 def quiet(fraction: float, message: str) -> None:
@@ -85,25 +98,26 @@ def copy_of(material: palette.Material, svbrdf: SVBRDF, bits: dict | None = None
 class Stage:
     """A scene, its parts dressed in a palette by the product's own node trees."""
 
-    def __init__(self, kind: str, number: int, size, samples: int):
+    def __init__(self, kind: str, number: int, size, grid: int):
         import bpy
 
-        self.bpy, self.samples = bpy, samples
-        self.scene = scenes.Scene(kind, number, size, samples)
+        self.bpy, self.grid = bpy, grid
+        self.scene = scenes.Scene(kind, number, size)
         scene = bpy.context.scene
         scene.render.use_persistent_data, scene.frame_end = False, 1
         for obj in [obj for obj in scene.objects if obj.type == "LIGHT"]:
             bpy.data.objects.remove(obj)
         scene.world = None
+        self.suns = []
         for i, (rotation, strength) in enumerate(SUNS):
             lamp = bpy.data.lights.new(f"sun {i}", "SUN")
             lamp.energy, lamp.angle = strength, 0
             obj = bpy.data.objects.new(lamp.name, lamp)
             obj.rotation_euler = rotation
             scene.collection.objects.link(obj)
+            self.suns.append(obj)
         scene.cycles.max_bounces = 0
-        scene.cycles.use_denoising = False
-        scene.cycles.samples = samples
+        scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
         render = scene.render
         render.use_border = render.use_crop_to_border = True
         render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = BORDER
@@ -129,23 +143,32 @@ class Stage:
         seen = look(self.bpy.context.scene, self.built)
         return [seen[material.name] for material in self.built]
 
-    def render(self) -> tuple[np.ndarray, float, float]:
-        """The picture, linear, the CPU seconds and Cycles' own peak memory in MB."""
-        peaks = [0.0]
+    def render(self, grid: int | None = None) -> list[np.ndarray]:
+        """The pictures under each sun and under all, linear."""
+        grid = grid or self.grid
+        scene = self.bpy.context.scene
+        scene.render.resolution_percentage, scene.cycles.samples, scene.cycles.filter_width = 100 * grid, 1, 0.01
+        pictures = []
+        for sun in self.suns:
+            for other in self.suns:
+                other.hide_render = other != sun
+            with tempfile.TemporaryDirectory() as folder:
+                scene.render.filepath = str(Path(folder) / "render.exr")
+                self.bpy.ops.render.render(write_still=True)
+                pictures.append(filtered(scenes._read(scene.render.filepath)[0], grid))
+        return [*pictures, sum(pictures)]
 
-        def listen(*arguments):
-            text = " ".join(map(str, arguments))
-            peaks.extend(float(x) for x in re.findall(r"Peak:? ?([\d.]+) ?M", text))
-
-        self.bpy.app.handlers.render_stats.append(listen)
-        start = time.process_time()
-        with tempfile.TemporaryDirectory() as folder:
-            self.bpy.context.scene.render.filepath = str(Path(folder) / "render.exr")
-            self.bpy.ops.render.render(write_still=True)
-            seconds = time.process_time() - start
-            picture = scenes._read(self.bpy.context.scene.render.filepath)[0]
-        self.bpy.app.handlers.render_stats.remove(listen)
-        return picture, seconds, max(peaks)
+    def cost(self, folder: Path) -> tuple[float, float]:
+        """CPU seconds and peak memory in MB of a process that renders the scene as it is dressed."""
+        scene, path = self.bpy.context.scene, folder / "scene.blend"
+        scene.render.resolution_percentage, scene.cycles.samples = 100, COST_SAMPLES
+        scene.cycles.filter_width = FILTER
+        for sun in self.suns:
+            sun.hide_render = False
+        self.bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=False)
+        said = subprocess.run([sys.executable, "-c", RENDER, str(path)], capture_output=True, text=True, check=True)
+        path.unlink()
+        return tuple(json.loads(next(line for line in said.stdout.splitlines() if line.startswith("["))))
 
     def file_bytes(self, folder: Path) -> int:
         """Size of a .blend that holds the materials, packed."""
@@ -156,52 +179,91 @@ class Stage:
         return size
 
 
+def filtered(fine: np.ndarray, grid: int) -> np.ndarray:
+    """Pixels of a picture (H grid, W grid, 3) of samples, by the Blackman-Harris window that Cycles uses."""
+    margin = math.ceil((FILTER - 1) / 2 * grid)
+    x = (np.arange(-margin, grid + margin) - (grid - 1) / 2) / (FILTER * grid) + 0.5
+    turns = 2 * np.pi * np.clip(x, 0, 1)
+    weights = 0.35875 - 0.48829 * np.cos(turns) + 0.14128 * np.cos(2 * turns) - 0.01168 * np.cos(3 * turns)
+    kernel = (weights / weights.sum()).astype(np.float32)
+    # the window's first sample is where the pixel's own ones begin, less the margin
+    whole = cv2.sepFilter2D(fine, -1, kernel, kernel, anchor=(margin, margin), borderType=cv2.BORDER_REPLICATE)
+    return whole[::grid, ::grid]
+
+
 def measure(kind: str, number: int, name: str, materials, options, work: Path) -> list[dict]:
     """A row per version of the palette in one scene."""
-    stage = Stage(kind, number, options.size, options.samples)
+    stage = Stage(kind, number, options.size, options.grid)
     full = [copy_of(material, material.svbrdf) for material in materials]
     stage.dress(full, work / "full")
     start = time.process_time()
     seen = stage.look()
     looking = time.process_time() - start
-    versions, reducing = {"full": full}, 0.0
-    start = time.process_time()
-    for factor in options.factors:
-        fitted = [copy_of(material, material.svbrdf) for material in full]
-        for material, one in zip(fitted, seen, strict=True):
-            palette.fit_material(material, one.texels * factor / palette.TEXELS_PER_PIXEL, quiet)
-        reducing = (time.process_time() - start) / len(full)
+    versions, fitting = {"full": full}, {}
+    for visible in options.visible:
+        version = f"fitted, {visible:g}"
         start = time.process_time()
-        versions[f"fitted, {factor:g} texel per pixel"] = fitted
-    rows, reference, gain = [], None, 1.0
+        versions[version] = [copy_of(material, material.svbrdf) for material in full]
+        for material, one in zip(versions[version], seen, strict=True):
+            palette.fit_material(material, one.texels, quiet, visible=visible)
+        fitting[version] = (time.process_time() - start) / len(full)
+    uniform = [reduction.shrink(m.svbrdf, 8 * math.ceil(one.texels / 8)) for m, one in zip(full, seen, strict=True)]
+    versions["all maps, 1 texel per pixel"] = [copy_of(m, svbrdf) for m, svbrdf in zip(full, uniform, strict=True)]
+    rows, reference, gains = [], None, []
     for version, made in versions.items():
         stage.dress(made, work / version.replace(" ", "_"))
-        picture, seconds, peak = stage.render()
-        if reference is None:
-            luminance = picture @ np.array([0.2126, 0.7152, 0.0722])
-            gain = min(0.2 / np.exp(np.log(np.maximum(luminance, 1e-4)).mean()), 0.95 / np.percentile(luminance, 98))
-        picture = srgb_from_linear(scenes.exposed(picture, gain))
-        reference = picture if reference is None else reference
-        difference = flip(reference, picture)
-        cv2.imwrite(str(work / f"{version.replace(' ', '_')}.png"), np.rint(picture[..., ::-1] * 255))
-        rows.append(
-            {
-                "scene": kind,
-                "palette": name,
-                "version": version,
-                "texture_bytes": sum(reduction.texture_bytes(reduction.maps_of(m.svbrdf), m.bits) for m in made),
-                "blend_bytes": stage.file_bytes(work),
-                "flip": float(difference.mean()),
-                "flip_98": float(np.percentile(difference, 98)),
-                "render_seconds": seconds,
-                "render_peak_mb": peak,
-                "sides": " ".join(str(reduction.largest(m.svbrdf)) for m in made),
-                "look_seconds": looking,
-                "fit_seconds_per_material": reducing,
-            }
-        )
-        print(rows[-1], flush=True)
+        pictures = stage.render()
+        gains = gains or [exposure(picture) for picture in pictures]
+        pictures = [encoded(picture, gain) for picture, gain in zip(pictures, gains, strict=True)]
+        reference = reference or pictures
+        differences = [flip(a, b) for a, b in zip(reference, pictures, strict=True)]
+        cv2.imwrite(str(work / f"{version}.png"), np.rint(pictures[-1][..., ::-1] * 255).astype(np.uint8))
+        row = {
+            "scene": kind,
+            "palette": name,
+            "version": version,
+            "texture_bytes": sum(reduction.texture_bytes(reduction.maps_of(m.svbrdf), m.bits) for m in made),
+            "blend_bytes": stage.file_bytes(work),
+            "flip": float(np.mean(differences)),
+            "flip_worst_light": float(max(difference.mean() for difference in differences)),
+            "flip_98": float(np.percentile(differences, 98)),
+            "sides": "; ".join(sides(m.svbrdf) for m in made),
+            "pixels": " ".join(f"{one.texels:.0f}" for one in seen),
+            "look_seconds": looking,
+            "fit_seconds_per_material": fitting.get(version, 0.0),
+        }
+        if version in ("full", SHIPPED):
+            row["render_seconds"], row["render_peak_mb"] = stage.cost(work)
+        rows.append(row)
+        print(row, flush=True)
+    if name == "bundled":
+        # what is left of the grid in the pictures
+        stage.dress(full, work / "full")
+        finer = [encoded(p, gain) for p, gain in zip(stage.render(options.grid + 1), gains, strict=True)]
+        least = tuple(min(a, b) for a, b in zip(finer[0].shape[:2], reference[0].shape[:2], strict=True))
+        floor = [
+            float(flip(a[: least[0], : least[1]], b[: least[0], : least[1]]).mean())
+            for a, b in zip(reference, finer, strict=True)
+        ]
+        rows[0]["flip_to_finer_grid"] = float(np.mean(floor))
+        print("to a finer grid", floor, flush=True)
     return rows
+
+
+def sides(svbrdf: SVBRDF) -> str:
+    """Texels of base colour, normal and roughness, a dash for values."""
+    maps = reduction.maps_of(svbrdf)
+    return " ".join(str(len(value)) if np.ndim(value) > 1 else "-" for value in maps.values())
+
+
+def exposure(picture: np.ndarray) -> float:
+    luminance = picture @ np.array([0.2126, 0.7152, 0.0722])
+    lit = luminance[luminance > 0]
+    return min(0.2 / np.exp(np.log(np.maximum(lit, 1e-4)).mean()), 0.95 / np.percentile(luminance, 98))
+
+
+def encoded(picture: np.ndarray, gain: float) -> np.ndarray:
+    return srgb_from_linear(np.clip(picture * gain, 0, 1).astype(np.float32))
 
 
 def chart(rows: list[dict], path: Path) -> None:
@@ -213,16 +275,18 @@ def chart(rows: list[dict], path: Path) -> None:
     for i, key in enumerate(dict.fromkeys((row["palette"], row["scene"]) for row in rows)):
         own = [row for row in rows if (row["palette"], row["scene"]) == key]
         whole = own[0]["texture_bytes"]
-        own = sorted(own[1:], key=lambda row: row["texture_bytes"])
+        plain = [row for row in own if row["version"].startswith("all")]
+        own = sorted((row for row in own if row["version"].startswith("fitted")), key=lambda row: row["texture_bytes"])
         x, y = [whole / row["texture_bytes"] for row in own], [row["flip"] for row in own]
         colour = charts.COLOURS[i % len(charts.COLOURS)]
         axes.plot(x, y, "o-", color=colour, markersize=3, linewidth=1, label=f"{key[1]}, {key[0]}")
         chosen = [(a, b) for a, b, row in zip(x, y, own, strict=True) if row["version"] == SHIPPED]
         axes.plot(*zip(*chosen, strict=True), "o", color=colour, markersize=9, fillstyle="none")
+        axes.plot([whole / row["texture_bytes"] for row in plain], [row["flip"] for row in plain], "x", color=colour)
     axes.axhline(0.02, color=charts.GREY, linewidth=0.8, linestyle=":")
     axes.axvline(4, color=charts.GREY, linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
-    axes.set_xlabel("texture memory, times less than full (rings: as `fit` does it)")
+    axes.set_xlabel("texture memory, times less than full (rings: as `fit` does; crosses: one side for all maps)")
     axes.set_ylabel("mean FLIP to the full palette")
     axes.legend(frameon=False, fontsize=7)
     charts.save(figure, path)
@@ -237,8 +301,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="one small scene, one palette")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    options.size, options.samples = ((480, 270), 16) if options.quick else (SIZE, SAMPLES)
-    options.factors = (palette.TEXELS_PER_PIXEL,) if options.quick else FACTORS
+    options.size, options.grid = ((480, 270), GRID) if options.quick else (SIZE, GRID)
+    options.visible = (reduction.VISIBLE,) if options.quick else VISIBLE
     name = "needs-quick" if options.quick else "needs"
     parts = records.Parts(options.output.parent / "parts" / name, options.minutes)
     work = parts.folder / "work"
@@ -267,11 +331,15 @@ def main(arguments: list[str] | None = None) -> int:
             "times_smaller_file": float(np.median([f["blend_bytes"] / r["blend_bytes"] for r, f in own])),
             "mean_flip": float(np.mean([r["flip"] for r, _ in own])),
             "largest_flip": float(max(r["flip"] for r, _ in own)),
-            "render_seconds_ratio": float(np.median([r["render_seconds"] / f["render_seconds"] for r, f in own])),
-            "render_peak_mb_less": float(np.median([f["render_peak_mb"] - r["render_peak_mb"] for r, f in own])),
+            "largest_flip_of_a_light": float(max(r["flip_worst_light"] for r, _ in own)),
         }
+        if "render_seconds" in own[0][0]:
+            ratios = [r["render_seconds"] / f["render_seconds"] for r, f in own]
+            summary[version]["render_seconds_ratio"] = float(np.median(ratios))
+            less = [f["render_peak_mb"] - r["render_peak_mb"] for r, f in own]
+            summary[version]["render_peak_mb_less"] = float(np.median(less))
         print(version, {k: round(v, 4) for k, v in summary[version].items()})
-    records.write(options.output, "needs", rows, {"summary": summary, "samples": options.samples}, parts)
+    records.write(options.output, "needs", rows, {"summary": summary, "grid": options.grid}, parts)
     chart(rows, options.output / "needs")
     return 0
 

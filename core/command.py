@@ -3,7 +3,7 @@
 import argparse
 import sys
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from .dependencies import install_command, missing
@@ -192,16 +192,19 @@ def _fit_one(material, seen, line, concept: Path | None, settings) -> None:
     if seen is None or seen.why:
         line.say(f"{material.name}: kept as it is: {seen.why if seen else 'the scene does not have it'}")
         return
-    have = largest(material.svbrdf)
-    if seen.texels > have and have < settings.resolution and concept is not None and concept.is_file():
-        again = resample_material(concept, settings, line.progress)
+    have, pixels = largest(material.svbrdf), seen.texels
+    if pixels > have and have < settings.resolution and concept is not None and concept.is_file():
+        quality = material.target["quality"] if material.target else settings.quality
+        again = resample_material(concept, replace(settings, quality=quality, full_maps=True), line.progress)
+        # a tile of which a part was kept is whole again
+        pixels *= again.metres_per_tile / material.metres_per_tile
         material.svbrdf, material.reduced, material.bits = again.svbrdf, again.reduced, again.bits
         material.metres_per_tile, have = again.metres_per_tile, largest(again.svbrdf)
         line.say(f"{material.name}: sampled again from its concept")
-    fit_material(material, seen.texels, line.progress, seen.displaced)
+    fit_material(material, pixels, line.progress, seen.displaced)
     line.say(
-        f"{material.name}: a tile is at most {seen.texels:.0f} px long and covers {seen.share:.1%} of a picture"
-        + (f"; its {have} px are fewer" if seen.texels > have else "")
+        f"{material.name}: a tile is at most {pixels:.0f} px long and covers {seen.share:.1%} of a picture"
+        + (f"; its {have} px are fewer" if pixels > have else "")
     )
     line.ledger(material.name, material.reduced)
 

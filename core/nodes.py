@@ -49,28 +49,30 @@ _NAMES = {
 RELIEFS = ("NORMAL", "BUMP", "DISPLACEMENT")
 
 
-def build_material(record, folder, *, pack, preview=None):
+def build_material(record, folder, *, pack, preview=None, shared=None):
     """Build one material in the current file and return it.
 
     record: one "ok" entry of palette.json["materials"]. folder: what the record's files are relative to. pack: store
     the files in the .blend, else refer to them. preview: (256, 256, 4) float32 sRGB-encoded RGBA, top row first, or
-    None. The height map gets no node until `Controls.relief` asks for it: it rides along as the custom properties
-    "height" (image), "height_scale" (tile widths) and "height_midlevel". Raises PaletteError for a failed record, a
-    file that is missing and a constant normal that isn't flat; what was built until then is removed.
+    None. shared: {(path, is data): image} of the caller: what is in it is not loaded again, what is not is added. The
+    height map gets no node until `Controls.relief` asks for it: it rides along as the custom properties "height"
+    (image), "height_scale" (tile widths) and "height_midlevel". Raises PaletteError for a failed record, a file that is
+    missing and a constant normal that isn't flat; what was built until then is removed.
     """
     if record["status"] != "ok":
         raise PaletteError(f"material '{record['name']}' failed, there is nothing to build: {record['error']}")
     material = bpy.data.materials.new(record["name"])
-    images = []
+    images, shared = [], {} if shared is None else shared
     try:
-        _build_tree(material, record, Path(folder), pack, images)
-        _keep_height(material, record, Path(folder), pack, images)
+        _build_tree(material, record, Path(folder), pack, images, shared)
+        _keep_height(material, record, Path(folder), pack, images, shared)
         if preview is not None:
             set_preview(material, preview)
     except BaseException:
         bpy.data.materials.remove(material)
-        for image in images:
-            bpy.data.images.remove(image)
+        for key, image in [*shared.items()]:
+            if image in images and image.users == 0:
+                bpy.data.images.remove(shared.pop(key))
         raise
     return material
 
@@ -346,11 +348,12 @@ def write_blend(path, palette_json, folder, previews, *, pack):
     """
     path = Path(path)
     records = [record for record in palette_json["materials"] if record["status"] == "ok"]
-    built = []
+    built, shared = [], {}
     with _names_free(record["name"] for record in records):
         try:
             for record in records:
-                material = build_material(record, folder, pack=pack, preview=previews.get(record["name"]))
+                preview = previews.get(record["name"])
+                material = build_material(record, folder, pack=pack, preview=preview, shared=shared)
                 built.append(material)
                 mark_asset(material, f"Extracted from {palette_json['photo']}")
             bpy.data.libraries.write(str(path), set(built), path_remap="RELATIVE", fake_user=True)
@@ -387,7 +390,7 @@ class _names_free:
             material.name = name
 
 
-def _build_tree(material, record, folder, pack, images):
+def _build_tree(material, record, folder, pack, images, shared):
     if material.node_tree is None:  # from Blender 5.0 on every material has a tree and `use_nodes` is deprecated
         material.use_nodes = True
     tree = material.node_tree
@@ -401,7 +404,7 @@ def _build_tree(material, record, folder, pack, images):
         if role not in _LABELS:
             continue
         if "file" in map_:
-            image = _load(folder, map_["file"], pack, data=role != "basecolor")
+            image = _load(folder, map_["file"], pack, shared, data=role != "basecolor")
             images.append(image)
             textures[role] = image
         else:
@@ -462,22 +465,24 @@ def _frame(tree, label, nodes):
     frame.select = False
 
 
-def _keep_height(material, record, folder, pack, images):
+def _keep_height(material, record, folder, pack, images, shared):
     height = record["maps"].get("height", {})
     if "file" not in height:
         return
-    image = _load(folder, height["file"], pack, data=True)
+    image = _load(folder, height["file"], pack, shared, data=True)
     images.append(image)
     material["height"] = image
     material["height_scale"] = float(height["scale"])
     material["height_midlevel"] = float(height["midlevel"])
 
 
-def _load(folder, file, pack, *, data):
+def _load(folder, file, pack, shared, *, data):
     path = folder / file
+    if (path, data) in shared:
+        return shared[path, data]
     if not path.is_file():
         raise PaletteError(f"texture file is missing: {path}")
-    image = bpy.data.images.load(str(path.resolve()), check_existing=False)
+    image = shared[path, data] = bpy.data.images.load(str(path.resolve()), check_existing=False)
     image.name = path.stem
     image.colorspace_settings.name = "Non-Color" if data else "sRGB"
     if pack:

@@ -4,6 +4,7 @@ photo + regions -> exemplar -> concept -> texture -> SVBRDF -> reduced SVBRDF ->
 """
 
 import dataclasses
+import hashlib
 import json
 import math
 import time
@@ -35,7 +36,7 @@ LEAST_SAMPLED = 32  # px
 CONCEPT_VERSION = 1
 PREVIEW = 256  # px
 LEAST_FITTED = 16  # px
-TEXELS_PER_PIXEL = 2.0  # of a picture, where a scene is known: renderers blur between texels
+HEIGHTS_PER_PIXEL = 2.0  # of a picture, where the relief is displaced
 EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
@@ -358,20 +359,24 @@ def _preview(svbrdf: SVBRDF) -> np.ndarray:
     return np.concatenate([srgb_from_linear(sphere[..., :3]), sphere[..., 3:]], -1)
 
 
-def fit_material(material: Material, texels: float, progress: Progress, displaced: bool = False) -> None:
-    """Leave in a material, whose tile is shown `texels` pixels long at most, what can then be told from the whole.
+def fit_material(
+    material: Material,
+    pixels: float,
+    progress: Progress,
+    displaced: bool = False,
+    visible: float = reduction.VISIBLE,
+) -> None:
+    """Leave in a material, whose tile is shown `pixels` long at most, what can then be told from the whole.
 
-    displaced: its height is displayed, so that normals which don't show are no reason to drop it.
+    displaced: its height is displayed, so that normals which don't show are no reason to drop it. visible: the error
+    that may be made, FLIP in [0, 1].
     """
     full = material.svbrdf
-    side = max(LEAST_FITTED, 8 * math.ceil(texels * TEXELS_PER_PIXEL / 8))
     with _timed(material.seconds, "fit"):
-        shrunk = reduction.shrink(full, side)
-        found = reduction.Reduction(shrunk) if displaced else reduction.reduce(shrunk, progress, parts=1)
-        before, after = (reduction.texture_bytes(reduction.maps_of(x), found.bits) for x in (full, shrunk))
-        if reduction.largest(full) > side:
-            change = {"map": "all", "change": f"{side} px are seen", "bytes": before - after, "flip": 0.0}
-            material.reduced = [*material.reduced, change]
+        found = reduction.reduce(full, progress, visible, 1, max(pixels, LEAST_FITTED))
+        if displaced:
+            side = max(LEAST_FITTED, math.ceil(pixels * HEIGHTS_PER_PIXEL))
+            found.svbrdf.height = reduction.shrink(full, side).height
         # what was constant before stands in the ledger already
         known = {(e["map"], e["change"]) for e in material.reduced}
         material.reduced = [*material.reduced, *(e for e in found.ledger if (e["map"], e["change"]) not in known)]
@@ -408,6 +413,7 @@ def read_material(record: dict, folder: Path) -> Material:
         error=record["error"],
         metres_per_tile=record["metres_per_tile"],
         rectification=record["rectification"],
+        target=record.get("target"),
     )
     if material.status != "ok":
         return material
@@ -538,6 +544,8 @@ def write_palette(
         progress(0.8 * i / len(palette.materials), f"writing {material.name}")
         record = (written or {}).get(material.name)
         records.append(record or write_material(material, folder / file_name(material.name)))
+    if not written:  # who has written them may refer to them already
+        _store_once(records, folder)
     if palette.regions:
         (folder / "masks").mkdir()
     for region in palette.regions:
@@ -557,6 +565,24 @@ def write_palette(
     _write_json(folder / "palette.json", content)
     progress(1.0, "written")
     return content
+
+
+def _store_once(records: list[dict], folder: Path) -> None:
+    """Maps of the same bits become one file, that of the first material which has it."""
+    first = {}
+    for record in records:
+        changed = False
+        for entry in record["maps"].values():
+            if "file" not in entry:
+                continue
+            path = folder / entry["file"]
+            same = first.setdefault(hashlib.sha256(path.read_bytes()).digest(), entry["file"])
+            if same != entry["file"]:
+                entry["file"], changed = same, True
+                path.unlink()
+        if changed:
+            name = file_name(record["name"])
+            _write_json(folder / name / f"{name}.json", record)
 
 
 def _write_geometry(palette: Palette, folder: Path) -> None:

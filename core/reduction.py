@@ -1,8 +1,8 @@
 """What a material does not need: the smallest maps whose rendering cannot be told from that of the full ones.
 
 Claim: every map becomes a value, or as few texels and bits as do, and the tile as few periods, so that no window of the
-tile differs by more than a mean FLIP of VISIBLE under any of LIGHTS, seen at a pixel per texel. One map after the other
-is made smaller, with what was decided before it in place:
+tile differs by more than a mean FLIP of VISIBLE under any of LIGHTS, seen at a pixel per texel, or at as many pixels as
+a scene shows of it. One map after the other is made smaller, with what was decided before it in place:
 
     tile       its k-th part: the mean over the k x k parts, which repeats without a seam
     normal     flat, or fewer texels: slopes s are averaged, and the variance that they lose widens the lobe,
@@ -11,10 +11,16 @@ is made smaller, with what was decided before it in place:
     roughness  its mean, or fewer texels
     height     the normals' texels; no renderer loads it until the relief is bump or displacement
 
-Sources: Andersson et al. 2020 (FLIP); Toksvig 2005, Kaplanyan et al. 2016 (normals' variance as roughness).
+The base colour, which shows most, is first, but leaves something of the error to the others: where it differs already,
+they add little (TURNS).
+
+Sources: Andersson et al. 2020 (FLIP); Toksvig 2005, Kaplanyan et al. 2016 (normals' variance as roughness); Irani and
+Peleg 1991 (back-projection).
 """
 
-from collections.abc import Callable
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -25,17 +31,21 @@ from .brdf import shade
 from .flip import flip
 from .image import linear_from_srgb, srgb_from_linear
 from .material import SVBRDF
-from .torus import frequencies, resize
+from .torus import resize
 
 VISIBLE = 0.02  # FLIP, mean over a window
 WINDOW = 128  # px, two degrees of the view
 LEAST_SIDE = 16  # px
 MOST_PARTS = 4
+TEXELS_PER_PIXEL = (0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.8)  # tried where a scene is known
+SAMPLES = 4  # along a pixel's side, at most
 FAR = 0.02  # mean difference of maps that is seen without rendering them
 # (light, view), of any length: a sun from the side, a low one, and one that the viewer sees mirrored
 LIGHTS = (((-0.6, 0.5, 0.8), (0, 0, 1)), ((0.9, 0.3, 0.35), (0, 0, 1)), ((0.1, 0.9, 0.7), (0, -0.9, 0.7)))
 FLAT = np.array([0, 0, 1], np.float32)
-KINDS = ("normal", "basecolor", "roughness")  # in the order of the search
+KINDS = ("normal", "basecolor", "roughness")
+# the map to be made smaller, and the share of the error that there may be after it
+TURNS = (("basecolor", 0.9), ("normal", 1.0), ("roughness", 1.0), ("basecolor", 1.0))
 CHANNELS = {"basecolor": 4, "normal": 4, "roughness": 1}  # as renderers hold them: three channels are padded to four
 
 Progress = Callable[[float, str], None]
@@ -59,13 +69,19 @@ def reduce(
     progress: Progress = lambda fraction, message: None,
     visible: float = VISIBLE,
     parts: int = MOST_PARTS,
+    pixels: float | None = None,
 ) -> Reduction:
     """The least maps that look like the given ones, which are constants or square, and what they save.
 
     visible: the error that may be made, FLIP in [0, 1]. parts: that the tile may be divided into, along each axis.
+    pixels: length of a tile in the picture; None: a pixel per texel.
     """
-    full = maps_of(svbrdf)
     found = Reduction(svbrdf)
+    full = maps_of(svbrdf)
+    most = max(map(_side, full.values()))
+    if pixels is not None and most > SAMPLES * pixels:
+        # more than a picture can tell, and no more is rendered here
+        full = maps_of(shrink(svbrdf, _eights(SAMPLES * pixels)))
 
     def note(kind: str, change: str, before: Maps, after: Maps, error: float) -> None:
         saved = texture_bytes(before, found.bits) - texture_bytes(after, found.bits)
@@ -76,31 +92,30 @@ def reduce(
         folded = _folded(full, k)
         if folded is None:
             continue
-        error = _error(full, _tiled(folded, k))
+        error = _Judge(full, pixels)(_tiled(folded, k))
         if error <= visible / 4:
             note("tile", f"1/{k} along each side", full, folded, error)
             full, found.parts, visible = folded, k, visible - error
             break
-    maps = full
-    for i, kind in enumerate(KINDS):
-        side = _side(maps[kind])
-        sizes = [0, *(side >> n for n in range(12) if side >> n >= min(side, LEAST_SIDE))] if side else []
-        least, error = None, 0.0
-        for step, size in enumerate(sizes):
-            progress(0.1 + 0.9 * (i + min(step, 4) / 5) / len(KINDS), f"reducing the {kind}")
-            candidate = _with(maps, full, kind, size)
-            of_it = _error(full, candidate)
-            if of_it <= visible:
-                least, error = candidate, of_it
-            if (size == 0) == (of_it <= visible):  # a constant does, or fewer texels don't
-                break
-        if least is None:
-            least = maps
-            if side:
+    judge, maps, errors = _Judge(full, pixels), full, dict.fromkeys(KINDS, 0.0)
+    for i, (kind, share) in enumerate(TURNS):
+
+        def error_of(candidate: Maps, i=i, kind=kind) -> float:
+            progress(0.1 + 0.9 * i / len(TURNS), f"reducing the {kind}")
+            return judge(candidate)
+
+        least = _least(maps, full, kind, pixels, error_of, visible * share)
+        if least is not None:
+            maps, errors[kind] = least
+    for kind in KINDS:
+        side = _side(full[kind])
+        if side and _side(maps[kind]) == side:
+            rounded = dict(maps, **{kind: _rounded(kind, maps[kind])})
+            if judge(rounded) > visible:
                 found.bits[kind] = 16  # 8 alone are seen
-        if (size := _side(least[kind])) < side or not side:
-            note(kind, _said(kind, least[kind]), {kind: full[kind]}, {kind: least[kind]}, error)
-        maps = least
+        if _side(maps[kind]) < max(side, 1):
+            before = maps_of(svbrdf) if found.parts == 1 else full
+            note(kind, _said(kind, maps[kind]), {kind: before[kind]}, {kind: maps[kind]}, errors[kind])
     height = svbrdf.height
     if _side(maps["normal"]) == 0:
         # the normal is the height's gradient: without slope there is no relief to displace
@@ -126,7 +141,7 @@ def texture_bytes(maps: Maps, bits: dict[str, int]) -> int:
 
 def say(ledger: list[dict]) -> list[str]:
     """The ledger's lines, for people."""
-    return [f"{e['map']}: {e['change']}" + (f", -{e['bytes'] / 1e6:.2f} MB" if e["bytes"] else "") for e in ledger]
+    return [f"{e['map']}: {e['change']}" + (f", {-e['bytes'] / 1e6:+.2f} MB" if e["bytes"] else "") for e in ledger]
 
 
 def shrink(svbrdf: SVBRDF, side: int) -> SVBRDF:
@@ -162,6 +177,39 @@ def _said(kind: str, value: np.ndarray) -> str:
     return {"normal": "flat", "basecolor": "one colour"}.get(kind) or f"{float(value):.2f} everywhere"
 
 
+def _least(maps, full, kind, pixels, error_of, most) -> tuple[Maps, float] | None:
+    """`maps` with the smallest of one kind whose error is at most `most`, and that error; None where all are larger."""
+    found = None
+
+    def passes(size: int) -> bool:
+        nonlocal found
+        candidate = _with(maps, full, kind, size)
+        error = error_of(candidate)
+        if error <= most:
+            found = candidate, error
+        return error <= most
+
+    sizes = _sizes(_side(maps[kind]), pixels)
+    # a value has no rounding, so it may do where few texels do not
+    if sizes and not passes(0):
+        bisect_left(sizes, True, 1, key=passes)
+    return found
+
+
+def _eights(length: float) -> int:
+    """A side of at least so many texels that is a multiple of 8."""
+    return max(LEAST_SIDE, 8 * math.ceil(length / 8))
+
+
+def _sizes(side: int, pixels: float | None) -> list[int]:
+    """The sides that a map of `side` texels may get instead, the least first, 0 for a value."""
+    if pixels is None:
+        smaller = {side >> n for n in range(1, 12) if side >> n >= LEAST_SIDE}
+    else:
+        smaller = {_eights(pixels * factor) for factor in TEXELS_PER_PIXEL}
+    return [0, *sorted(size for size in smaller if size < side)] if side else []
+
+
 def _with(maps: Maps, full: Maps, kind: str, side: int) -> Maps:
     """`maps` with one of them made from its full self at `side` texels, 0 for a constant, as 8 bits hold it."""
     changed = dict(maps)
@@ -170,7 +218,7 @@ def _with(maps: Maps, full: Maps, kind: str, side: int) -> Maps:
         changed["normal"] = normal
         changed["roughness"] = _wider(full["roughness"], variance)
     else:
-        # the roughness from here on is that which the normals left
+        # the roughness is that which the normals left
         changed[kind] = _shrunk(maps[kind], side)
     if side:
         changed[kind] = _rounded(kind, changed[kind])
@@ -185,23 +233,22 @@ def _shrunk(value: np.ndarray, side: int) -> np.ndarray:
         return value.mean((0, 1), dtype=np.float64).astype(np.float32)
     if side == _side(value):
         return value
-    small = _resampled(value.reshape(*value.shape[:2], -1), side).reshape(side, side, *value.shape[2:])
-    return np.clip(small, value.min(), value.max())
+    return _resampled(value, side, value.min(), value.max())
 
 
-def _resampled(value: np.ndarray, side: int) -> np.ndarray:
-    """Square texels (n, n, C) on the torus at a smaller side: all that it can hold of the spectrum, unchanged. A blur
-    against aliasing before it would show where the texels are as large as pixels."""
-    n = len(value)
-    spectrum = torch.fft.rfft2(torch.from_numpy(np.ascontiguousarray(value.transpose(2, 0, 1))))
-    most = (side - 1) // 2
-    kept = torch.zeros(value.shape[2], side, side // 2 + 1, dtype=spectrum.dtype)
-    kept[:, : most + 1, : most + 1] = spectrum[:, : most + 1, : most + 1]
-    kept[:, -most:, : most + 1] = spectrum[:, -most:, : most + 1]
-    # texels lie at the centres of their squares, which become larger
-    v, u = frequencies(side, side)
-    kept = kept * torch.exp(0.5j * (1 - side / n) * (v + u)) * (side / n) ** 2
-    return np.ascontiguousarray(torch.fft.irfft2(kept, s=(side, side)).permute(1, 2, 0).numpy())
+def _resampled(value: np.ndarray, side: int, least: float, most: float) -> np.ndarray:
+    """Square texels on the torus at a smaller side, in [least, most]: so that the mean over each of them, once they are
+    shown, is nearly that of what it replaces. Showing them is bilinear, which blurs; their own means would show less.
+    """
+    means = small = _means(value, side)
+    for _ in range(2):  # further ones sharpen what the first have clipped
+        shown = _texels(small, (0, 0), len(value), len(value))
+        small = np.clip(small + means - _means(shown, side), least, most)
+    return small
+
+
+def _means(value: np.ndarray, side: int) -> np.ndarray:
+    return cv2.resize(value, (side, side), interpolation=cv2.INTER_AREA)
 
 
 def _shrunk_normal(normal: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -209,12 +256,12 @@ def _shrunk_normal(normal: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarra
     if not _side(normal) or side == _side(normal):
         return normal, np.zeros((), np.float32)
     slopes = normal[..., :2] / np.maximum(normal[..., 2:], 0.05)
-    both = np.concatenate([slopes, np.square(slopes).sum(-1, keepdims=True)], -1)
+    squares = np.square(slopes).sum(-1)
     if side == 0:
-        return FLAT, both[..., 2].mean(dtype=np.float64).astype(np.float32)
-    small = _resampled(both, side)
-    smooth = np.concatenate([small[..., :2], np.ones_like(small[..., :1])], -1)
-    variance = np.maximum(small[..., 2] - np.square(small[..., :2]).sum(-1), 0)
+        return FLAT, squares.mean(dtype=np.float64).astype(np.float32)
+    variance = np.maximum(_means(squares, side) - np.square(_means(slopes, side)).sum(-1), 0)
+    small = _resampled(slopes, side, -20.0, 20.0)
+    smooth = np.concatenate([small, np.ones_like(small[..., :1])], -1)
     return smooth / np.linalg.norm(smooth, axis=-1, keepdims=True), variance
 
 
@@ -258,32 +305,59 @@ def _folded(full: Maps, k: int) -> Maps | None:
     return folded if all(np.abs(tiled[kind] - full[kind]).mean() < FAR for kind in KINDS) else None
 
 
-def _error(full: Maps, maps: Maps) -> float:
-    """FLIP, mean over a window, the worst of the lights and of the windows in which one of the maps changes most."""
-    side = max(_side(value) for value in full.values())
-    worst = 0.0
-    corners = {_changed_most(kind, full[kind], maps[kind], side) for kind in KINDS if full[kind] is not maps[kind]}
-    for corner in sorted(corners):
-        pairs = zip(_rendered(full, corner, side), _rendered(maps, corner, side), strict=True)
-        worst = max(worst, *(float(flip(a, b).mean()) for a, b in pairs))
-    return worst
+class _Judge:
+    """The error of maps instead of the full ones: FLIP, mean over a window, the worst of the lights and of the windows
+    in which one of the maps changes most. `pixels` are the length of a tile; None: a pixel per texel."""
+
+    def __init__(self, full: Maps, pixels: float | None):
+        self._full, self._pictures = full, {}
+        self._side = max(map(_side, full.values()))
+        self._across = self._side if pixels is None else max(1, round(pixels))
+        self._samples = max(1, math.ceil(self._side / self._across)) if self._side else 1
+        self._window = min(WINDOW, self._across)
+
+    def __call__(self, maps: Maps) -> float:
+        full, worst = self._full, 0.0
+        corners = {self._changed_most(kind, full[kind], maps[kind]) for kind in KINDS if full[kind] is not maps[kind]}
+        for corner in sorted(corners):
+            if corner not in self._pictures:
+                self._pictures[corner] = self._rendered(full, corner)
+            pairs = zip(self._pictures[corner], self._rendered(maps, corner), strict=True)
+            worst = max(worst, *(float(flip(a, b).mean()) for a, b in pairs))
+        return worst
+
+    def _changed_most(self, kind: str, full: np.ndarray, other: np.ndarray) -> tuple[int, int]:
+        """Row and column in pixels of the window, of those side by side, in which two maps differ most."""
+        # every second texel of both axes tells where
+        a, b = (_texels(x, (0, 0), self._side, self._side, 2) for x in (full, other))
+        if kind == "basecolor":
+            a, b = np.sqrt(a), np.sqrt(b)
+        change = np.square(a - b).reshape(len(a), len(a), -1).sum(-1)
+        windows = _means(change, self._across // self._window)
+        row, column = np.unravel_index(windows.argmax(), windows.shape)
+        return int(row) * self._window, int(column) * self._window
+
+    def _rendered(self, maps: Maps, corner: tuple[int, int]) -> list[np.ndarray]:
+        """Pictures (window, window, 3), encoded, of a window under each of LIGHTS, a white plane being 1."""
+        n, window = self._samples, self._window
+        albedo, normal, roughness = (
+            torch.from_numpy(
+                np.array(_texels(maps[kind], [n * c for c in corner], n * window, n * self._across), np.float32)
+            )
+            for kind in ("basecolor", "normal", "roughness")
+        )
+        normal = torch.nn.functional.normalize(normal, dim=-1)
+        pictures = []
+        for light, view in LIGHTS:
+            light, view = (
+                torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view)
+            )
+            shaded = shade(albedo, normal, roughness, light.expand_as(normal), view.expand_as(normal)) / light[2]
+            pictures.append(srgb_from_linear(_means(shaded.clamp(0, 1).numpy(), window)))
+        return pictures
 
 
-def _changed_most(kind: str, full: np.ndarray, other: np.ndarray, side: int) -> tuple[int, int]:
-    """Row and column of the window, of those side by side, in which two maps differ most."""
-    window = min(WINDOW, side)
-    # every second texel of both axes tells where
-    a, b = (_texels(x, (0, 0), side, side, 2) for x in (full, other))
-    if kind == "basecolor":
-        a, b = np.sqrt(a), np.sqrt(b)
-    change = np.square(a - b).reshape(len(a), len(a), -1).sum(-1)
-    n, half = side // window, window // 2
-    sums = change[: n * half, : n * half].reshape(n, half, n, half).sum((1, 3))
-    row, column = np.unravel_index(sums.argmax(), sums.shape)
-    return int(row) * window, int(column) * window
-
-
-def _texels(value: np.ndarray, corner: tuple[int, int], count: int, side: int, step: int = 1) -> np.ndarray:
+def _texels(value: np.ndarray, corner: Sequence[int], count: int, side: int, step: int = 1) -> np.ndarray:
     """Every step-th of count x count texels of a map from `corner` on, shown at `side` texels to the tile as renderers
     do: bilinear."""
     size = _side(value)
@@ -293,21 +367,3 @@ def _texels(value: np.ndarray, corner: tuple[int, int], count: int, side: int, s
     if size == 0:
         return np.broadcast_to(value, (len(rows), len(columns), *np.shape(value)))
     return cv2.remap(value, *np.meshgrid(columns, rows), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-
-
-def _rendered(maps: Maps, corner: tuple[int, int], side: int) -> list[np.ndarray]:
-    """Pictures (WINDOW, WINDOW, 3), encoded, of a window of the tile under each of LIGHTS, a white plane being 1."""
-    window = min(WINDOW, side)
-    albedo, normal, roughness = (
-        torch.from_numpy(np.array(_texels(maps[kind], corner, window, side), np.float32))
-        for kind in ("basecolor", "normal", "roughness")
-    )
-    normal = torch.nn.functional.normalize(normal, dim=-1)
-    pictures = []
-    for light, view in LIGHTS:
-        light, view = (
-            torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view)
-        )
-        shaded = shade(albedo, normal, roughness, light.expand_as(normal), view.expand_as(normal)) / light[2]
-        pictures.append(srgb_from_linear(shaded.clamp(0, 1).numpy()))
-    return pictures

@@ -104,7 +104,7 @@ class _Extracts(BackgroundOperator):
         entry = put_in_palette(settings, made.key, material, not self.replaces_files)
         entry.name = made.record["name"]
         entry.seed = self.chosen["seed"]
-        entry.warnings = "\n".join(made.record["warnings"])
+        entry.warnings = "\n".join([*made.record["warnings"], *_target(made.record)])
         self.built[made.key] = material.session_uid
 
     def finish(self, context, scene, result):
@@ -128,7 +128,7 @@ class _Extracts(BackgroundOperator):
         failed = [made.record for made in result.made if made.record["status"] != "ok"]
         if len(failed) == len(result.made):
             raise PaletteError("No material was made. " + _say(failed))
-        if self.kept is None:
+        if self.kept is None and not self.chosen["target_error"]:  # of which the quality isn't that of all
             history.add(self.chosen, [made.record for made in result.made])
         said = f"{_count(len(result.made) - len(failed))} made"
         if result.cancelled:
@@ -234,6 +234,16 @@ class MATERIAL_PALETTE_OT_resample(_Extracts, Operator):
         return lambda progress, send: _resample(*work, progress, send)
 
 
+def _target(record):
+    """What became of the error asked for, in words."""
+    target = record.get("target")
+    if target is None:
+        return []
+    found = "" if target.get("found") is None else f", found {target['found']:.3f}"
+    asked, predicted = target["asked"], target["predicted"]
+    return [f"Error asked {asked:.3f}, predicted {predicted:.3f}{found}: quality {target['quality']}"]
+
+
 def _sampling(settings, seed):
     return {
         "quality": settings.quality,
@@ -265,6 +275,7 @@ def _read_order(settings, regions, seed, is_whole):
         "white_balance": settings.white_balance,
         "metres_per_tile": settings.metres_per_tile,
         "keep_concepts": settings.keep_concepts and settings.engine == "patch",
+        "target_error": (settings.target_error or None) if settings.engine == "patch" else None,
     }
     read = photo_reader(settings.photo)
     masks = _read_masks(settings, regions)

@@ -86,6 +86,7 @@ class MATERIAL_PALETTE_OT_fit_scene(BackgroundOperator, Operator):
             before = _bytes(full)
             material = nodes.build_material(record, result.folder, pack=True, preview=preview)
             material[FITTED] = True
+            _share(material, full)
             put_in_palette(settings, key, material, self.keep_full)
             saved += before - _bytes(material)
             if told is not None:
@@ -115,6 +116,19 @@ def _put_full_back(entry):
     take_place(full, fitted)
     entry.material = full
     nodes.remove_material(fitted)
+
+
+def _share(material, full):
+    """What the fit has left as it was is the full material's, and stored once; so what was learnt goes along."""
+    from ..core.nodes import Controls
+
+    for kind in ("basecolor", "normal", "roughness"):
+        mine, theirs = (Controls(m).node(kind) for m in (material, full))
+        if mine and theirs and mine.image and theirs.image and tuple(mine.image.size) == tuple(theirs.image.size):
+            spare, mine.image = mine.image, theirs.image
+            bpy.data.images.remove(spare)
+    for name in ("concept", "concept_tensors"):
+        setattr(material.material_palette, name, getattr(full.material_palette, name))
 
 
 def _bytes(material):

@@ -190,6 +190,9 @@ class OptionsPanel:
         column = layout.column()
         column.prop(settings, "seed")
         column.prop(settings, "scale")
+        target = column.row()
+        target.active = settings.engine == "patch"
+        target.prop(settings, "target_error")
         column.prop(settings, "rectify")
         column.prop(settings, "focal_length")
         column.prop(settings, "flatten")
