@@ -38,7 +38,7 @@ from material_palette.core.material import SVBRDF  # noqa: E402
 from material_palette.core.region import read_regions  # noqa: E402
 
 SIZE, GRID = (960, 540), 4  # samples along a pixel's side
-BORDER = (0.35, 0.65, 0.25, 0.55)  # what is rendered of the picture: from left to right and from below
+BORDER = (0.38, 0.62, 0.28, 0.52)  # what is rendered of the picture: from left to right and from below
 FILTER = 1.5  # px, width of Cycles' own pixel filter
 SUNS = (((0.6, 0.2, 0.4), 2.5), ((0.9, 0.0, -0.9), 1.2), ((0.3, -0.9, 0.0), 0.8))  # rotation, strength
 VISIBLE = (0.01, 0.02, 0.04)
@@ -200,6 +200,7 @@ def measure(kind: str, number: int, name: str, materials, options, work: Path) -
     seen = stage.look()
     looking = time.process_time() - start
     versions, fitting = {"full": full}, {}
+    print(kind, name, [round(one.texels) for one in seen], flush=True)
     for visible in options.visible:
         version = f"fitted, {visible:g}"
         start = time.process_time()
@@ -207,8 +208,6 @@ def measure(kind: str, number: int, name: str, materials, options, work: Path) -
         for material, one in zip(versions[version], seen, strict=True):
             palette.fit_material(material, one.texels, quiet, visible=visible)
         fitting[version] = (time.process_time() - start) / len(full)
-    uniform = [reduction.shrink(m.svbrdf, 8 * math.ceil(one.texels / 8)) for m, one in zip(full, seen, strict=True)]
-    versions["all maps, 1 texel per pixel"] = [copy_of(m, svbrdf) for m, svbrdf in zip(full, uniform, strict=True)]
     rows, reference, gains = [], None, []
     for version, made in versions.items():
         stage.dress(made, work / version.replace(" ", "_"))
@@ -236,7 +235,7 @@ def measure(kind: str, number: int, name: str, materials, options, work: Path) -
             row["render_seconds"], row["render_peak_mb"] = stage.cost(work)
         rows.append(row)
         print(row, flush=True)
-    if name == "bundled":
+    if kind == "room" and name == "bundled":
         # what is left of the grid in the pictures
         stage.dress(full, work / "full")
         finer = [encoded(p, gain) for p, gain in zip(stage.render(options.grid + 1), gains, strict=True)]
@@ -275,18 +274,16 @@ def chart(rows: list[dict], path: Path) -> None:
     for i, key in enumerate(dict.fromkeys((row["palette"], row["scene"]) for row in rows)):
         own = [row for row in rows if (row["palette"], row["scene"]) == key]
         whole = own[0]["texture_bytes"]
-        plain = [row for row in own if row["version"].startswith("all")]
-        own = sorted((row for row in own if row["version"].startswith("fitted")), key=lambda row: row["texture_bytes"])
+        own = sorted(own[1:], key=lambda row: row["texture_bytes"])
         x, y = [whole / row["texture_bytes"] for row in own], [row["flip"] for row in own]
         colour = charts.COLOURS[i % len(charts.COLOURS)]
         axes.plot(x, y, "o-", color=colour, markersize=3, linewidth=1, label=f"{key[1]}, {key[0]}")
         chosen = [(a, b) for a, b, row in zip(x, y, own, strict=True) if row["version"] == SHIPPED]
         axes.plot(*zip(*chosen, strict=True), "o", color=colour, markersize=9, fillstyle="none")
-        axes.plot([whole / row["texture_bytes"] for row in plain], [row["flip"] for row in plain], "x", color=colour)
     axes.axhline(0.02, color=charts.GREY, linewidth=0.8, linestyle=":")
     axes.axvline(4, color=charts.GREY, linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
-    axes.set_xlabel("texture memory, times less than full (rings: as `fit` does; crosses: one side for all maps)")
+    axes.set_xlabel("texture memory, times less than full (rings: as `fit` does it)")
     axes.set_ylabel("mean FLIP to the full palette")
     axes.legend(frameon=False, fontsize=7)
     charts.save(figure, path)

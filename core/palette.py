@@ -440,6 +440,7 @@ def read_material(record: dict, folder: Path) -> Material:
         roughness if roughness.ndim else float(roughness),
         (height - relief["midlevel"]) * relief["scale"] if height.ndim else None,
     )
+    material.preview = _preview(material.svbrdf)
     if record["exemplar"]:
         picture = cv2.imread(str(folder / record["exemplar"]))
         material.exemplar = None if picture is None else np.ascontiguousarray(picture[..., ::-1])

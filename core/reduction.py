@@ -37,7 +37,7 @@ VISIBLE = 0.02  # FLIP, mean over a window
 WINDOW = 128  # px, two degrees of the view
 LEAST_SIDE = 16  # px
 MOST_PARTS = 4
-TEXELS_PER_PIXEL = (0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.8)  # tried where a scene is known
+TEXELS_PER_PIXEL = (0.4, 0.6, 0.85, 1.1, 1.4, 1.75, 2.3)  # tried where a scene is known
 SAMPLES = 4  # along a pixel's side, at most
 FAR = 0.02  # mean difference of maps that is seen without rendering them
 # (light, view), of any length: a sun from the side, a low one, and one that the viewer sees mirrored
@@ -45,7 +45,7 @@ LIGHTS = (((-0.6, 0.5, 0.8), (0, 0, 1)), ((0.9, 0.3, 0.35), (0, 0, 1)), ((0.1, 0
 FLAT = np.array([0, 0, 1], np.float32)
 KINDS = ("normal", "basecolor", "roughness")
 # the map to be made smaller, and the share of the error that there may be after it
-TURNS = (("basecolor", 0.9), ("normal", 1.0), ("roughness", 1.0), ("basecolor", 1.0))
+TURNS = (("basecolor", 0.9), ("normal", 1.0), ("roughness", 1.0))
 CHANNELS = {"basecolor": 4, "normal": 4, "roughness": 1}  # as renderers hold them: three channels are padded to four
 
 Progress = Callable[[float, str], None]
@@ -352,7 +352,7 @@ class _Judge:
             light, view = (
                 torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view)
             )
-            shaded = shade(albedo, normal, roughness, light.expand_as(normal), view.expand_as(normal)) / light[2]
+            shaded = shade(albedo, normal, roughness, light, view) / light[2]
             pictures.append(srgb_from_linear(_means(shaded.clamp(0, 1).numpy(), window)))
         return pictures
 

@@ -228,7 +228,7 @@ class MATERIAL_PALETTE_OT_resample(_Extracts, Operator):
         self.kept = entry.material.material_palette.concept, entry.material.material_palette.concept_tensors
         asset = entry.material.asset_data
         self.description = asset.description if asset else ""
-        self.chosen = _sampling(settings, entry.seed + self.variation)
+        self.chosen = sampling(settings, entry.seed + self.variation)
         folder = None if settings.pack else _unused(_output_folder(settings))
         work = self.kept, entry.key, self.chosen, folder, bpy.app.tempdir
         return lambda progress, send: _resample(*work, progress, send)
@@ -244,7 +244,7 @@ def _target(record):
     return [f"Error asked {asked:.3f}, predicted {predicted:.3f}{found}: quality {target['quality']}"]
 
 
-def _sampling(settings, seed):
+def sampling(settings, seed):
     return {
         "quality": settings.quality,
         "resolution": settings.resolution,
@@ -268,7 +268,7 @@ def _keep_concept(material, made, kept):
 
 def _read_order(settings, regions, seed, is_whole):
     """Read from the scene what the worker needs; raises PaletteError naming what can't be used."""
-    chosen = _sampling(settings, seed) | {
+    chosen = sampling(settings, seed) | {
         "engine": settings.engine,
         "rectify": settings.rectify,
         "flatten": settings.flatten,
@@ -365,15 +365,11 @@ def _resample(kept, key, chosen, folder, tempdir, progress, send):
     """As `_work`, of a concept that a material keeps."""
     progress(0.0, "Getting ready")
     from ..core.output import staged
-    from ..core.palette import Palette, Settings, resample_material, write_material, write_palette
+    from ..core.palette import Palette, Settings, write_material, write_palette
     from ..core.region import file_name
 
     settings = Settings(**chosen)
-    with tempfile.TemporaryDirectory(prefix="material_palette_", dir=tempdir) as beside:
-        path = Path(beside) / "concept.json"
-        path.write_text(kept[0], encoding="utf-8")
-        path.with_suffix(".safetensors").write_bytes(base64.b64decode(kept[1]))
-        material = resample_material(path, settings, lambda f, message: progress(_EXTRACTION * f, message))
+    material = sample_kept(kept, settings, tempdir, lambda f, message: progress(_EXTRACTION * f, message))
     with staged(folder, False) if folder else _temporary(tempdir) as staging:
         record = write_material(material, staging / file_name(material.name))
         made = _Made(key, record, staging, material.preview)
@@ -382,6 +378,17 @@ def _resample(kept, key, chosen, folder, tempdir, progress, send):
             palette = Palette(None, "a kept concept", [], settings, [material])
             write_palette(palette, staging, progress, {record["name"]: record})
     return _Extracted([made], folder or staging, staging, folder is None)
+
+
+def sample_kept(kept, settings, tempdir, progress):
+    """The core's material of a concept as a material keeps it: its JSON, and its tensors in base 64."""
+    from ..core.palette import resample_material
+
+    with tempfile.TemporaryDirectory(prefix="material_palette_", dir=tempdir) as beside:
+        path = Path(beside) / "concept.json"
+        path.write_text(kept[0], encoding="utf-8")
+        path.with_suffix(".safetensors").write_bytes(base64.b64decode(kept[1]))
+        return resample_material(path, settings, progress)
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from bpy.types import Operator
 from ..core.errors import PaletteError
 from .background import BackgroundOperator
 from .export import read_map
+from .extract import sample_kept, sampling
 from .palette import adopt_adjustments, put_in_palette, take_place
 
 FITTED = "palette_fitted"  # custom property of a material that this has made
@@ -24,6 +25,20 @@ class _Fitted:
 
     folder: Path
     made: list
+
+
+@dataclass
+class _Order:
+    """What is wanted of an entry: what cameras see of it, its full maps and their metres per tile, and where one is
+    kept its concept and how to sample it."""
+
+    key: int
+    name: str
+    seen: object
+    svbrdf: object
+    metres: float
+    kept: tuple
+    chosen: dict | None
 
 
 class MATERIAL_PALETTE_OT_fit_scene(BackgroundOperator, Operator):
@@ -64,7 +79,10 @@ class MATERIAL_PALETTE_OT_fit_scene(BackgroundOperator, Operator):
             if one.why:
                 self.kept.append(f"'{entry.material.name}' stays: {one.why}")
             else:
-                order.append((entry.key, entry.material.name, one, *_svbrdf(_full(entry))))
+                full = _full(entry)
+                kept = full.material_palette.concept, full.material_palette.concept_tensors
+                chosen = sampling(context.scene.material_palette, entry.seed) if kept[0] else None
+                order.append(_Order(entry.key, entry.material.name, one, *_svbrdf(full), kept, chosen))
         if not order:
             raise PaletteError("; ".join(self.kept))
         temporary = bpy.app.tempdir
@@ -173,20 +191,27 @@ def _svbrdf(material):
 
 def _work(order, temporary, progress):
     """Runs on the worker; touches no bpy."""
-    from ..core.palette import Material, fit_material, write_material
+    from ..core.palette import Material, Settings, fit_material, write_material
+    from ..core.reduction import largest
     from ..core.region import file_name
 
     folder = Path(tempfile.mkdtemp(prefix="material_palette_", dir=temporary))
     try:
         made = []
-        for i, (key, name, seen, svbrdf, metres) in enumerate(order):
-            material = Material(name, svbrdf=svbrdf, metres_per_tile=metres)
+        for i, one in enumerate(order):
+            material = Material(one.name, svbrdf=one.svbrdf, metres_per_tile=one.metres)
 
-            def share(fraction, message, i=i, name=name):
+            def share(fraction, message, i=i, name=one.name):
                 progress((i + fraction) / len(order), f"{name}: {message}")
 
-            fit_material(material, seen.texels, share, seen.displaced)
-            made.append((key, write_material(material, folder / file_name(name)), material.preview))
+            pixels, have = one.seen.texels, largest(one.svbrdf)
+            if one.chosen and pixels > have and have < one.chosen["resolution"]:
+                again = sample_kept(one.kept, Settings(**one.chosen, full_maps=True), temporary, share)
+                # a tile of which a part was kept is whole again
+                pixels *= again.metres_per_tile / one.metres
+                material.svbrdf, material.metres_per_tile = again.svbrdf, again.metres_per_tile
+            fit_material(material, pixels, share, one.seen.displaced)
+            made.append((one.key, write_material(material, folder / file_name(one.name)), material.preview))
         return _Fitted(folder, made)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

@@ -214,3 +214,65 @@ def test_concepts_of_diffusion_have_a_folder_of_their_own(inputs, capsys):
 def test_a_texture_too_small_or_large_for_its_scale_is_refused(inputs, capsys):
     assert extract(inputs, "--resolution", "8192", "--scale", "0.5") == 2
     assert "16384 px" in capsys.readouterr().err
+
+
+def test_a_camera_that_needs_more_than_the_maps_have_gets_it_from_the_concept(inputs, capsys):
+    import bpy
+    from material_palette.core.nodes import build_material
+    from material_palette.core.palette import read_palette, write_material
+    from material_palette.core.reduction import shrink
+    from stage import camera, plane
+
+    assert extract(inputs, "--keep-concepts", "--full-maps") == 0
+    whole = cv2.imread(str(inputs / "out/a/a_basecolor.png")).astype(float)
+    # as a palette that was reduced too far: 24 of 96 texels
+    content, materials, _ = read_palette(inputs / "out")
+    materials[0].svbrdf = shrink(materials[0].svbrdf, 24)
+    content["materials"][0] = write_material(materials[0], inputs / "out" / "a")
+    (inputs / "out" / "palette.json").write_text(json.dumps(content))
+    blurred = cv2.resize(cv2.imread(str(inputs / "out/a/a_basecolor.png")).astype(float), (96, 96))
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.resolution_x = scene.render.resolution_y = 200
+    scene.render.resolution_percentage, scene.frame_end = 100, 1
+    plane("wall", build_material(content["materials"][0], inputs / "out", pack=True), 2.0)
+    camera("near", (0, 0, 5), scale=1.0)  # a tile is 200 px long
+    bpy.ops.wm.save_as_mainfile(filepath=str(inputs / "scene.blend"))
+    arguments = ["fit", str(inputs / "out"), "--scene", str(inputs / "scene.blend"), "-o", str(inputs / "near")]
+    assert main(arguments) == 0
+    assert "a: sampled again from its concept" in capsys.readouterr().out
+    (record, *_) = json.loads((inputs / "near/palette.json").read_text())["materials"]
+    assert record["metres_per_tile"] == pytest.approx(1.0)
+    found = cv2.imread(str(inputs / "near" / record["maps"]["basecolor"]["file"])).astype(float)
+    assert found.shape == whole.shape
+    # the region's own detail is there again, not a blown-up blur
+    assert np.abs(found - whole).mean() < 0.2 * np.abs(blurred - whole).mean()
+
+
+def test_maps_of_the_same_bits_are_one_file(inputs):
+    import bpy
+    from material_palette.core.palette import Palette, read_palette, write_palette
+    from material_palette.core.reduction import maps_of
+
+    assert extract(inputs, "--full-maps") == 0
+    _, (a, b), settings = read_palette(inputs / "out")
+    b.svbrdf.normal, b.svbrdf.height = a.svbrdf.normal, a.svbrdf.height
+    for material in (a, b):
+        material.texture = np.zeros((8, 8, 3), np.uint8)
+    (inputs / "two").mkdir()
+    content = write_palette(Palette(None, "photo.png", [], settings, [a, b]), inputs / "two")
+    maps = [record["maps"] for record in content["materials"]]
+    assert maps[1]["normal"]["file"] == maps[0]["normal"]["file"] == "a/a_normal.png"
+    assert maps[1]["basecolor"]["file"] == "b/b_basecolor.png"
+    assert not (inputs / "two/b/b_normal.png").exists()
+    assert json.loads((inputs / "two/b/b.json").read_text())["maps"] == maps[1]
+    assert np.allclose(maps_of(read_palette(inputs / "two")[1][1].svbrdf)["normal"], a.svbrdf.normal, atol=0.01)
+
+    from material_palette.core.nodes import images_of, write_blend
+
+    write_blend(inputs / "two" / "palette.blend", content, inputs / "two", {}, pack=True)
+    bpy.ops.wm.open_mainfile(filepath=str(inputs / "two" / "palette.blend"))
+    images = [images_of(bpy.data.materials[name]) for name in "ab"]
+    # base colours each, the normals and the heights of both once
+    assert len(set(images[0]) & set(images[1])) == 2 and len({*images[0], *images[1]}) == 4

@@ -64,7 +64,7 @@ def side(material, kind="Palette Base Color"):
 def test_seen_materials_get_what_the_camera_shows_and_unseen_ones_the_least(palette):
     assert bpy.ops.material_palette.fit_scene() == {"FINISHED"}
     stone, grain = (entry.material for entry in palette)
-    assert 16 < side(stone) <= 104 and side(grain) <= 16  # a metre is 50 px, and a px two texels
+    assert 16 < side(stone) < SIDE and side(grain) <= 16  # a metre is 50 px
     assert [stone.name, grain.name] == ["stone", "grain"]
     assert bpy.data.objects["wall"].data.materials[0] == stone
     assert all(image.packed_file for image in bpy.data.images if image.users)
@@ -81,11 +81,12 @@ def test_it_is_fitted_anew_from_the_full_maps_with_the_artists_adjustments(palet
     from material_palette.core.nodes import Controls
 
     bpy.ops.material_palette.fit_scene()
+    first = side(palette[0].material)
     Controls(palette[0].material).hue = 0.7
     bpy.data.cameras["front"].ortho_scale = 2.0
     bpy.context.view_layer.update()
     assert bpy.ops.material_palette.fit_scene() == {"FINISHED"}
-    assert side(palette[0].material) in (200, 208)
+    assert side(palette[0].material) > first
     assert Controls(palette[0].material).hue == pytest.approx(0.7)
     assert side(palette[0].previous) == SIDE
     assert len([m for m in bpy.data.materials if m.name.startswith("stone")]) == 2
@@ -95,6 +96,21 @@ def test_full_materials_are_deleted_where_that_is_asked_for(palette):
     assert bpy.ops.material_palette.fit_scene(keep_full=False) == {"FINISHED"}
     assert [m.name for m in bpy.data.materials] == ["grain", "stone"]
     assert max(image.size[0] for image in bpy.data.images) < SIDE
+
+
+def test_what_was_learnt_and_what_stays_as_it_was_go_along(palette):
+    bpy.context.scene.material_palette.resolution = SIDE  # more than the maps have is not asked for
+    palette[0].material.material_palette.concept = "learnt"
+    palette[0].material.material_palette.concept_tensors = "numbers"
+    bpy.data.cameras["front"].ortho_scale = 0.5  # nearer than a texel to a pixel
+    bpy.context.view_layer.update()
+    bpy.ops.material_palette.fit_scene()
+    fitted, full = palette[0].material, palette[0].previous
+    assert fitted.material_palette.concept == "learnt" and fitted.material_palette.concept_tensors == "numbers"
+    images = [m.node_tree.nodes["Palette Base Color"].image for m in (fitted, full)]
+    assert images[0] == images[1] and images[0].users == 2
+    assert bpy.ops.material_palette.discard_before() == {"FINISHED"}
+    assert side(fitted) == SIDE and images[0].users == 1
 
 
 def test_a_displaced_material_keeps_its_height(palette):
@@ -126,7 +142,7 @@ def test_the_command_line_fits_into_another_folder(made, tmp_path, capsys):
     assert before == {p: p.read_bytes() for p in made[0].rglob("*") if p.is_file()}
     content = json.loads((tmp_path / "small" / "palette.json").read_text(encoding="utf-8"))
     stone, grain = content["materials"]
-    assert any(line["map"] == "all" and line["bytes"] > 0 for line in stone["reduced"])
+    assert any(line["map"] == "basecolor" and line["bytes"] > 0 for line in stone["reduced"])
     assert (tmp_path / "small" / "palette.blend").is_file()
     # the same folder would lose the full maps
     assert main([*arguments, str(made[0])]) == 2
