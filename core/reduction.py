@@ -107,15 +107,14 @@ def reduce(
         least = _least(maps, full, kind, pixels, error_of, visible * share)
         if least is not None:
             maps, errors[kind] = least
+    given = maps_of(svbrdf) if found.parts == 1 else full
     for kind in KINDS:
-        side = _side(full[kind])
-        if side and _side(maps[kind]) == side:
+        if maps[kind] is full[kind] and _side(full[kind]):
             rounded = dict(maps, **{kind: _rounded(kind, maps[kind])})
             if judge(rounded) > visible:
                 found.bits[kind] = 16  # 8 alone are seen
-        if _side(maps[kind]) < max(side, 1):
-            before = maps_of(svbrdf) if found.parts == 1 else full
-            note(kind, _said(kind, maps[kind]), {kind: before[kind]}, {kind: maps[kind]}, errors[kind])
+        if _side(maps[kind]) < max(_side(given[kind]), 1):
+            note(kind, _said(kind, maps[kind]), {kind: given[kind]}, {kind: maps[kind]}, errors[kind])
     height = svbrdf.height
     if _side(maps["normal"]) == 0:
         # the normal is the height's gradient: without slope there is no relief to displace

@@ -35,9 +35,10 @@ def test_maps_that_no_picture_shows_become_values():
     assert sum(entry["bytes"] for entry in found.ledger) == 9 * N * N
 
 
-def test_fine_relief_in_a_close_up_is_kept():
+@pytest.mark.parametrize("pixels", [None, 2 * N])
+def test_fine_relief_in_a_close_up_is_kept(pixels):
     height = (fine() - 0.5) * 0.4 / N
-    found = reduce(SVBRDF(GREY, relief(height), 0.5, height))
+    found = reduce(SVBRDF(GREY, relief(height), 0.5, height), pixels=pixels)
     assert found.svbrdf.normal.shape == (N, N, 3) and found.svbrdf.height.shape == (N, N)
 
 
@@ -46,9 +47,10 @@ def test_fine_colour_is_kept():
     assert reduce(SVBRDF(albedo, FLAT, 0.5)).svbrdf.albedo.shape == albedo.shape
 
 
-def test_glossy_variation_of_the_roughness_is_kept():
+@pytest.mark.parametrize("pixels", [None, 2 * N, N // 2])
+def test_glossy_variation_of_the_roughness_is_kept(pixels):
     roughness = np.where(tileable_noise(N, N) > 0.5, 0.15, 0.6).astype(np.float32)
-    found = reduce(SVBRDF(GREY, FLAT, roughness))
+    found = reduce(SVBRDF(GREY, FLAT, roughness), pixels=pixels)
     assert np.ndim(found.svbrdf.roughness) == 2
     small = found.svbrdf.roughness
     assert small.max() - small.min() > 0.4
@@ -73,6 +75,21 @@ def test_what_is_smooth_gets_fewer_texels_and_still_tiles():
     assert wrap_ratio(found.svbrdf.albedo) < 1.6
     assert np.allclose(found.svbrdf.albedo.mean(), 0.3, atol=0.01)
     assert all(entry["flip"] <= reduction.VISIBLE for entry in found.ledger)
+
+
+def test_from_afar_there_are_fewer_texels_and_none_are_lost_in_a_close_up():
+    colour = 0.1 + 0.6 * tileable_noise(N, N)[..., None] + 0.2 * fine()[..., None]
+    full = SVBRDF(np.repeat(colour, 3, -1).astype(np.float32), FLAT, 0.5)
+    sides = [reduction.largest(reduce(full, pixels=pixels).svbrdf) for pixels in (24, 2 * N)]
+    assert sides[0] < N == sides[1]
+    # means of the full map, not picked texels
+    assert np.allclose(reduce(full, pixels=16).svbrdf.albedo.mean((0, 1)), full.albedo.mean((0, 1)), atol=0.01)
+
+
+def test_relief_too_far_away_to_be_seen_dulls_the_surface():
+    height = (fine() - 0.5) * 0.4 / N
+    found = reduce(SVBRDF(GREY, relief(height), 0.2, height), pixels=16).svbrdf
+    assert reduction.largest(found) < N and np.mean(found.roughness) > 0.3
 
 
 def test_a_weave_keeps_one_period():
