@@ -9,11 +9,11 @@ picture 1-photo
 press Paint "mode == 'PAINT' and len(regions) == 1" 15
 sleep 2
 if [ "$(state brush)" = True ]; then
-  drag 310 600 310 700 340 700 340 600 370 600 370 850
+  drag 350 600 350 800
   expect "shares[0] > 0.001" 15
   picture 2-painted
   before=$(state 'shares[0]')
-  drag 310 850 350 850
+  drag 350 800 450 800
   expect "shares[0] > $before" 15
   key ctrl+z
   expect "shares[0] <= $before" 15

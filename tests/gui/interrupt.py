@@ -94,7 +94,7 @@ def story():
     # a render that goes on in the background while materials are put into the file; the clicks outside end it
     yield from begin()
     scene.render.engine, scene.render.resolution_percentage = "CYCLES", 10
-    scene.cycles.samples, scene.cycles.use_adaptive_sampling = 2**20, False
+    scene.cycles.samples, scene.cycles.use_adaptive_sampling, scene.cycles.use_denoising = 2**20, False, False
     bpy.context.preferences.view.render_display_type = "NONE"
     with in_view():
         assert bpy.ops.render.render("INVOKE_DEFAULT") == {"RUNNING_MODAL"}

@@ -45,12 +45,13 @@ x, y = (int(v) / 1000 for v in sys.argv[2:])
 print(round(left + x * (right - left)), round(top + y * (bottom - top)))
 PY
 }
-# drag X Y X Y ...: the left button held from place to place of the photo
+# drag X Y X Y ...: the left button held from place to place of the photo. A busy Blender takes a press for one at the
+# place where the mouse is by then.
 drag() {
   local held=0
   while [ $# -ge 2 ]; do
     xdo mousemove $(at "$1" "$2"); sleep 0.15
-    ((held)) || { xdo mousedown 1; sleep 0.15; held=1; }
+    ((held)) || { xdo mousedown 1; sleep ${PALETTE_PATIENCE:-1}; held=1; }
     shift 2
   done
   xdo mouseup 1
