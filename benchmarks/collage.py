@@ -87,9 +87,9 @@ def scenes(data: Path) -> list[Truth]:
 def photos(data: Path, file: Path = LABELS) -> list[Truth]:
     """Real photos of the data folder of which some patches are labelled by hand in `file`, in its order.
 
-    They are named "photo_.." or "unseen_.." by their group: the second was labelled when all else was chosen. A patch
-    is [left, top, right, bottom] in percent of the photo, well within a material. "sky" comes last among the labels:
-    it is no material to find, but should be in none.
+    They are named "photo_.." or "later_.." by their group: the later were labelled when features and merging were
+    chosen, and looked at only for the rule about sky. A patch is [left, top, right, bottom] in percent of the photo,
+    well within a material. "sky" comes last among the labels: it is no material to find, but should be in none.
     """
     found = []
     groups = json.loads(file.read_text(encoding="utf-8"))

@@ -7,9 +7,9 @@
 
 DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages are made of textures of the test split,
 which nothing was fitted on; no scene and none of its materials was either. Of real photos, patches are labelled by hand
-(photos.json; those called unseen when all else was chosen): what is measured there is which patches are together, not
-where borders lie. Writes segmentation.csv, a row per measure, photo and method, as it goes (a second call goes on where
-the first ended), segmentation.json, the chart and sheet.jpg.
+(photos.json; the later ones when features and merging were chosen): what is measured is which patches are together,
+not where borders lie. Writes segmentation.csv, a row per measure, photo and method, as it goes (a second call goes on
+where the first ended), segmentation.json, the chart and sheet.jpg.
 """
 
 import argparse
@@ -43,7 +43,7 @@ from material_palette.core.segmentation.pick import Click, select  # noqa: E402
 COLLAGES = 12
 BOUND = 6  # the user's upper bound, as by default
 SHOWN = ("kodak_", "azure_")  # photos that may be shown
-KINDS = {"scene": "scenes", "collage": "collages", "photo": "real photos", "unseen": "real photos, unseen"}
+KINDS = {"scene": "scenes", "collage": "collages", "photo": "real photos", "later": "real photos, later"}
 PARTS = ("photos", "auto", "stability", "pick", "time", "sheet")
 
 
