@@ -9,7 +9,7 @@ DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages 
 which nothing was fitted on; no scene and none of its materials was either. Of real photos, patches are labelled by hand
 (photos.json; the later ones when features and merging were chosen): what is measured is which patches are together,
 not where borders lie. Writes segmentation.csv, a row per measure, photo and method, as it goes (a second call goes on
-where the first ended), segmentation.json, the chart and sheet.jpg.
+where the first ended), segmentation.json, charts and sheet.jpg.
 """
 
 import argparse
@@ -70,13 +70,23 @@ def changed(pixels: np.ndarray, truth: np.ndarray):
     yield "noise 3 %", linear_from_srgb(np.clip(encoded / 255 + noise, 0, 1)), truth
     yield "blur 1.5 px", cv2.GaussianBlur(pixels, (0, 0), 1.5), truth
     for stops in (-2, 2):
-        yield f"{stops:+} EV", np.clip(pixels * np.float32(2.0**stops), 0, 1), truth
+        exposed = np.clip(pixels * np.float32(2.0**stops), 0, 1)
+        yield f"{stops:+} EV", exposed, truth
+    yield "+2 EV, where not white", exposed, without(truth, (exposed >= 1).all(-1))
     for scale in (0.5, 2):
         method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
         size = {"dsize": None, "fx": scale, "fy": scale}
         resized = cv2.resize(pixels, interpolation=method, **size).clip(0)
         labels = cv2.resize(truth.astype(np.int16), interpolation=cv2.INTER_NEAREST, **size)
         yield f"scale x{scale}", resized, labels.astype(int)
+
+
+def without(truth: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """truth (H, W), unknown in the pixels `lost` (H, W) bool; of materials that then cover 1 % of the photo."""
+    kept = np.where(lost, -1, truth)
+    large = np.bincount(kept.ravel() + 1, minlength=truth.max() + 2)[1:] >= 0.01 * truth.size
+    number = np.append(np.where(large, np.cumsum(large) - 1, -1), -1)  # the last is for what is unknown
+    return number[kept]
 
 
 class Table:
@@ -240,15 +250,17 @@ def sheet(data: Path, folder: Path) -> None:
 
 def chart(table: Table, folder: Path) -> None:
     """IoU per method, on each kind of photo, and of clicks."""
-    panels = defaultdict(lambda: defaultdict(list))
+    whole, clicked = defaultdict(lambda: defaultdict(list)), defaultdict(lambda: defaultdict(list))
     for part, photo, method, measure, value in table.rows:
         kind = KINDS.get(photo.split("_")[0])
         if part in ("photos", "auto") and measure == "iou":
-            panels[f"{kind}: IoU"][method].append(float(value))
-        elif part == "pick" and measure in ("iou_1", "iou_3") and "best" not in method:
-            panels[f"IoU after {'1 click' if measure == 'iou_1' else '3 clicks'}"][method].append(float(value))
-    if panels:
-        charts.bars(panels, folder / "segmentation")
+            whole[f"{kind}: IoU"][method].append(float(value))
+        elif part == "pick" and measure in ("iou_1", "iou_3"):
+            count = "1 click" if measure == "iou_1" else "3 clicks"
+            clicked[f"{kind}: IoU after {count}"][method].append(float(value))
+    for panels, name in ((whole, "auto"), (clicked, "pick")):
+        if panels:
+            charts.bars(panels, folder / name)
 
 
 def main(given: list[str] | None = None) -> int:
@@ -258,7 +270,7 @@ def main(given: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--collages", type=int, default=COLLAGES)
     parser.add_argument("--measure", choices=("auto", "pick"), help=argparse.SUPPRESS)
-    parser.add_argument("--quick", action="store_true", help="two collages, four methods")
+    parser.add_argument("--quick", action="store_true", help="two collages, whole photos only")
     arguments = parser.parse_args(given)
     if arguments.measure:
         measure_time(arguments.data, arguments.measure)

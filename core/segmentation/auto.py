@@ -31,7 +31,7 @@ SIZE_POWER = 0.4  # p
 TOUCHING_UNTIL = 40  # regions; from there on regions that don't touch may merge too
 ONE_MATERIAL = 16.0  # squared distance of two regions' vectors; below it they are one material
 LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and are left out
-CLIPPED = 99.5  # of L: white, all three channels at their end
+CLIPPED = 98.5  # of L, smoothed: white, all three channels at their end
 CLIPPED_SHARE = 0.75  # of a region; what has more than a quarter of its pixels left holds a texture
 SKY_BLUE = 8.0  # -b
 SKY_LIGHTNESS = 40.0  # of L
@@ -271,7 +271,8 @@ def _sky(features: Features, parts: np.ndarray) -> np.ndarray:
 def _no_textures(features: Features, parts: np.ndarray, owner: np.ndarray) -> dict[str, np.ndarray]:
     """By reason the (parts,) bool that are of a region of owner (n,) without texture."""
     count = owner.max() + 1
-    clipped = np.bincount(features.labels.ravel(), (features.lab[..., 0] >= CLIPPED).ravel()) / features.size
+    smooth = cv2.GaussianBlur(features.lab[..., 0], (0, 0), 1.5)  # noise and JPEG take single pixels off the end
+    clipped = np.bincount(features.labels.ravel(), (smooth >= CLIPPED).ravel()) / features.size
     bands = features.statistics[:, BAND_COLUMNS]
     contrast = bands[:, 2] > CONTRAST
     blown, sharpness = np.zeros(len(owner), bool), np.full(count, np.nan)
