@@ -7,7 +7,8 @@
 Scenes are those of `scenes.py`; the materials are CC0, of DATA's test split (all of polyhaven, every fourth of the
 others), each once in six scenes. Every row gives for every part an SVBRDF and its scale; they are compared with the
 truth at the truth's scale, and the scene is rendered again with them. Writes endtoend.csv (a row per part and method),
-rerender.csv (per scene and method), endtoend.json, the charts and the sheet.
+rerender.csv (per scene and method), endtoend.json, the charts and the sheet; and resemblance.csv, how near what is
+extracted is to other materials of the same class.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import csv
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -346,6 +348,52 @@ def run_scene(number: int, tested, every, options, keep: Path) -> dict:
     return result
 
 
+# ---------------------------------------------------------------- resemblance
+
+
+def resembling(number: int, tested, every, options) -> list[dict]:
+    """The paper's other table, on a scene's photo: distances of maps to those of a random material of their class.
+
+    Rows: ours from true masks and from automatic ones; the known material itself (the least that can be asked for);
+    ours against a material of another class (no resemblance at all).
+    """
+    torch.set_num_threads(1)
+    kind = tuple(scenes.KINDS)[number % len(scenes.KINDS)]
+    parts, across = cast(tested, number), scenes.KINDS[kind]
+    truth = {part: known.read() for part, known in parts.items()}
+    scene = scenes.Scene(kind, number, options.size, options.samples)
+    scene.dress(truth, {part: tile_of(maps, across[part]) for part, maps in truth.items()})
+    shown = scene.show()
+    view, found = palette.rectification.look(shown.photo), []
+    auto = automatic(shown)[0] if options.auto else {}
+    for i, (part, mask) in enumerate(shown.masks.items()):
+        random, known, tile = np.random.default_rng([number, i, 1]), parts[part], across[part]
+        alike = [m for m in every if m.kind == known.kind and m.name != known.name]
+        if not alike:
+            continue
+        same = alike[int(random.integers(len(alike)))].read()
+        others = [m for m in every if m.kind != known.kind]
+        other = others[int(random.integers(len(others)))].read()
+        rows = {"the material itself": (same, Found(truth[part], truth[part].albedo.shape[1] / tile))}
+        for label, region in (("true masks", mask), ("automatic", auto.get(part))):
+            if region is None:
+                continue
+            try:
+                ours = extracted(
+                    shown.photo, region, shown, part, "balanced", DECOMPOSERS[:1], view, options.resolution
+                )["unet"]
+            except PaletteError as error:
+                print(f"{part}, {label}: {error}")
+                continue
+            rows[f"ours, {label}"] = same, ours
+            if label == "true masks":
+                rows["ours, other class"] = other, ours
+        for row, (reference, answer) in rows.items():
+            facts = {"scene": f"{number}_{kind}", "part": part, "material": known.name, "class": known.kind, "row": row}
+            found.append(facts | compare(reference, tile, answer, 1000 * number + i))
+    return found
+
+
 # ---------------------------------------------------------------- results
 
 
@@ -395,6 +443,16 @@ def duels(rows: list[dict]) -> dict:
                 for i, key in enumerate(MEASURES)
             }
     return found
+
+
+def resemblance_table(rows: list[dict]) -> str:
+    """Markdown: medians over the parts."""
+    lines = ["| row | parts | A | N | R |", "|---|---|---|---|---|"]
+    for name in dict.fromkeys(r["row"] for r in rows):
+        own = [r for r in rows if r["row"] == name]
+        cells = " | ".join(f"{np.median([r[key] for r in own]):.3f}" for key in "ANR")
+        lines.append(f"| {name} | {len(own)} | {cells} |")
+    return "\n".join(lines)
 
 
 def write(results: list[dict], parts: records.Parts, keep: Path, options) -> None:
@@ -454,6 +512,15 @@ def main(arguments: list[str] | None = None) -> int:
             results.append(found)
     if results:
         write(results, parts, keep, options)
+    resemblance = []
+    for number in range(0 if quick else options.scenes):
+        make = partial(resembling, number, tested, every, options)
+        resemblance += parts.get(f"resemblance{number}", make) or []
+    if resemblance:
+        records.write(
+            options.output, "resemblance", resemblance, {"table": resemblance_table(resemblance).splitlines()}, parts
+        )
+        print(resemblance_table(resemblance))
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import threading
 import time
 from dataclasses import fields, replace
 from pathlib import Path
@@ -264,8 +265,8 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
     from .annotations import read_annotations
     from .image import read_photo
     from .output import staged
-    from .palette import Material, Settings, extract_palette, write_palette
-    from .region import add_geometry, parse_corners, parse_measure, read_regions
+    from .palette import Material, Settings, extract_palette, write_material, write_palette
+    from .region import add_geometry, file_name, parse_corners, parse_measure, read_regions
 
     settings = Settings(
         **_sampling(arguments),
@@ -310,10 +311,14 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         seen = _look(arguments.fit_scene, [region.name for region in regions]) if arguments.fit_scene else {}
         seconds["regions"] = time.perf_counter() - start
 
+        written = {}
+
         def on_material(material: Material) -> None:
             if material.error:
                 line.say(f"{material.name}: FAILED: {material.error}")
             else:
+                if not arguments.fit_scene:
+                    written[material.name] = write_material(material, staging / file_name(material.name))
                 line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
                 if material.target is not None:
                     said = ", ".join(f"{key} {value}" for key, value in material.target.items())
@@ -334,7 +339,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
                 _fit_one(material, seen.get(material.name), line, None, settings)
         if len(failed) == len(regions):
             raise PaletteError("no material could be made: " + "; ".join(material.error for material in failed))
-        content = write_palette(palette, staging, line.progress)
+        content = write_palette(palette, staging, line.progress, written)
         previews = {material.name: material.preview for material in palette.materials if not material.error}
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
     line.say(f"{len(regions) - len(failed)} of {len(regions)} materials written to {folder}")
@@ -364,10 +369,10 @@ def _diffusion(arguments: argparse.Namespace):
 
 
 class _Line:
-    """Progress of one photo: a line that is rewritten on a terminal, nothing but results in a log."""
+    """Progress of one photo: a line that is rewritten on a terminal, nothing but results in a log. For any thread."""
 
     def __init__(self, name: str):
-        self._name, self._shown, self._start = name, 0.0, time.monotonic()
+        self._name, self._shown, self._start, self._lock = name, 0.0, time.monotonic(), threading.Lock()
         self._terminal = sys.stderr.isatty()
 
     def progress(self, fraction: float, message: str) -> None:
@@ -377,12 +382,14 @@ class _Line:
         self._shown = now
         elapsed = now - self._start
         left = f"{elapsed * (1 - fraction) / fraction:.0f} s left" if fraction > 0.03 else ""
-        print(f"\r{self._name} {fraction:4.0%} {left:11} {message[:60]:60}", end="", file=sys.stderr, flush=True)
+        with self._lock:
+            print(f"\r{self._name} {fraction:4.0%} {left:11} {message[:60]:60}", end="", file=sys.stderr, flush=True)
 
     def say(self, text: str) -> None:
-        if self._terminal:
-            print("\r" + " " * 110 + "\r", end="", file=sys.stderr, flush=True)
-        print(f"{self._name}: {text}", flush=True)
+        with self._lock:
+            if self._terminal:
+                print("\r" + " " * 110 + "\r", end="", file=sys.stderr, flush=True)
+            print(f"{self._name}: {text}", flush=True)
 
     def ledger(self, name: str, reduced: list[dict]) -> None:
         """What the material does without, what it would have cost and what error it makes."""

@@ -7,8 +7,10 @@ import dataclasses
 import hashlib
 import json
 import math
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +39,7 @@ CONCEPT_VERSION = 1
 PREVIEW = 256  # px
 LEAST_FITTED = 16  # px
 HEIGHTS_PER_PIXEL = 2.0  # of a picture, where the relief is displaced
+LARGEST_ABREAST = 2048  # px: larger materials are finished one by one, for memory
 EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
@@ -173,8 +176,8 @@ def extract_palette(
     """Extract one material per region of a photo (H, W, 3) float32 linear.
 
     A region that cannot be extracted becomes a material with status "failed"; the others are finished. on_material is
-    called with each material as soon as it is done. focal is the photo's focal length in px where it is known.
-    progress may raise Cancelled, which ends the call.
+    called with each material as soon as it is done, in their order but on another thread, as progress may be. focal is
+    the photo's focal length in px where it is known. progress may raise Cancelled, which ends the call.
     Raises PaletteError for settings that cannot be honoured and when there is no region.
     """
     settings.check()
@@ -183,27 +186,61 @@ def extract_palette(
     start = time.perf_counter()
     engine = engines.open_engine(settings.engine, settings.diffusion)
     palette = Palette(pixels, photo_name, regions, settings, [])
-    with _one_thread_each():
-        view = None
+    progress = _onward(progress)
+    view = None
+    # engines leave a part of the cores free: what comes behind them is done for one region while the next is sampled
+    with _one_thread_each(), ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as behind:
         if settings.rectify == "auto" and any(region.corners is None for region in regions):
             progress(0.0, "looking for lines")
             with _timed(palette.seconds, "look"):
                 view = rectification.look(pixels, focal)
+        finishing: list[Future[Material]] = []
         for i, region in enumerate(regions):
             share = _part(progress, i / len(regions), (i + 1) / len(regions), f"{region.name}: ")
             try:
-                material = extract_material(pixels, region, settings, share, view, focal, engine)
+                material, texture = _textured(pixels, region, settings, share, view, focal, engine)
             except PaletteError as error:
-                material = Material(region.name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
-            palette.materials.append(material)
-            if on_material:
-                on_material(material)
+                material, texture = _failed(region.name, error, settings), None
+            if finishing:
+                finishing[-1].result()  # what failed there ends it here
+            finishing.append(behind.submit(_end_of, material, texture, settings, share, on_material))
+            if settings.resolution > LARGEST_ABREAST:
+                finishing[-1].result()
+        palette.materials += [future.result() for future in finishing]
     progress(1.0, "done")
     for material in palette.materials:
         for stage, seconds in material.seconds.items():
             palette.seconds[stage] = palette.seconds.get(stage, 0.0) + seconds
     palette.seconds["extract"] = time.perf_counter() - start
     return palette
+
+
+def _failed(name: str, error: PaletteError, settings: Settings) -> Material:
+    return Material(name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
+
+
+def _end_of(material: Material, texture, settings, progress: Progress, on_material) -> Material:
+    if material.error is None:
+        try:
+            _finish(material, texture, settings, progress)
+        except PaletteError as error:
+            material = _failed(material.name, error, settings)
+    if on_material:
+        on_material(material)
+    return material
+
+
+def _onward(progress: Progress) -> Progress:
+    """Progress that two threads may call and that never goes back."""
+    lock, at = threading.Lock(), 0.0
+
+    def both(fraction: float, message: str) -> None:
+        nonlocal at
+        with lock:
+            at = max(at, fraction)
+            progress(at, message)
+
+    return both
 
 
 @contextmanager
@@ -234,6 +271,14 @@ def extract_material(
     Raises PaletteError for settings that cannot be honoured and for a region too small to hold a texture.
     """
     settings.check()
+    material, texture = _textured(pixels, region, settings, progress, view, focal, engine)
+    _finish(material, texture, settings, progress)
+    return material
+
+
+def _textured(pixels, region, settings, progress, view, focal, engine) -> tuple[Material, np.ndarray]:
+    """The material of a region so far, and its texture, which `_finish` takes: (H, W, 3) float32 sRGB-encoded at the
+    photo's scale, or the linear colour (3,) of a uniform region."""
     check_region(region)
     engine = engine or engines.open_engine(settings.engine, settings.diffusion)
     learnt = 0.03 + 0.83 * engine.LEARNING_SHARE
@@ -254,24 +299,21 @@ def extract_material(
 
     if exemplar.uniform is not None:
         material.warnings.append("the region has one colour up to noise; the material is a constant")
-        svbrdf = decomposition.constant(exemplar.uniform)
-    else:
-        with _timed(seconds, "learn"):
-            concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.03, learnt))
-        if settings.keep_concepts:
-            tensors, facts = engine.to_tensors(concept)
-            facts |= {
-                "engine": settings.engine,
-                "metres_per_texel": material.metres_per_tile / settings.sampled,
-                "rectification": material.rectification,
-            }
-            material.concept = tensors, facts
-        judge = None
-        if settings.target_error is not None:
-            settings, judge = _cheapest(material, encoded, exemplar.mask, settings)
-        svbrdf = _sample(material, engine, concept, settings, progress, learnt, judge)
-    _finish(material, svbrdf, settings.full_maps, progress)
-    return material
+        return material, exemplar.uniform
+    with _timed(seconds, "learn"):
+        concept = engine.learn(encoded, exemplar.mask, _part(progress, 0.03, learnt))
+    if settings.keep_concepts:
+        tensors, facts = engine.to_tensors(concept)
+        facts |= {
+            "engine": settings.engine,
+            "metres_per_texel": material.metres_per_tile / settings.sampled,
+            "rectification": material.rectification,
+        }
+        material.concept = tensors, facts
+    judge = None
+    if settings.target_error is not None:
+        settings, judge = _cheapest(material, encoded, exemplar.mask, settings)
+    return material, _sample(material, engine, concept, settings, progress, learnt, judge)
 
 
 def _cheapest(material: Material, encoded: np.ndarray, mask: np.ndarray, settings: Settings):
@@ -322,11 +364,11 @@ def resample_material(path: Path, settings: Settings, progress: Progress) -> Mat
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise PaletteError(f"'{path}' holds no concept that can be read ({error}); extract it again") from error
     with _one_thread_each():
-        _finish(material, _sample(material, engine, concept, settings, progress, 0.06), settings.full_maps, progress)
+        _finish(material, _sample(material, engine, concept, settings, progress, 0.06), settings, progress)
     return material
 
 
-def _sample(material: Material, engine, concept, settings, progress: Progress, start: float, judge=None) -> SVBRDF:
+def _sample(material: Material, engine, concept, settings, progress: Progress, start: float, judge=None) -> np.ndarray:
     with _timed(material.seconds, "sample"):
         size = settings.sampled, settings.sampled
         texture = engine.sample(concept, size, settings.seed, _part(progress, start, 0.86), settings.quality)
@@ -334,18 +376,25 @@ def _sample(material: Material, engine, concept, settings, progress: Progress, s
         pixels = texture.pixels
         if judge is not None:
             judge(pixels)
-        if settings.sampled != settings.resolution:
-            pixels = np.clip(resize(pixels, (settings.resolution, settings.resolution)), 0, 1)
-        material.texture = sheet.thumbnail(np.tile(pixels, (2, 2, 1)))
-    with _timed(material.seconds, "decompose"):
-        return decomposition.decompose(linear_from_srgb(pixels), _part(progress, 0.86, 0.96), settings.decomposer)
+    return pixels
 
 
-def _finish(material: Material, svbrdf: SVBRDF, full_maps: bool, progress: Progress) -> None:
+def _finish(material: Material, texture: np.ndarray, settings: Settings, progress: Progress) -> None:
+    """From the texture, as `_textured` gives it, to the material's least maps and its picture."""
     seconds = material.seconds
+    with _timed(seconds, "decompose"):
+        if texture.ndim == 1:
+            svbrdf = decomposition.constant(texture)
+        else:
+            if settings.sampled != settings.resolution:
+                texture = np.clip(resize(texture, (settings.resolution, settings.resolution)), 0, 1)
+            material.texture = sheet.thumbnail(np.tile(texture, (2, 2, 1)))
+            svbrdf = decomposition.decompose(
+                linear_from_srgb(texture), _part(progress, 0.86, 0.96), settings.decomposer
+            )
     with _timed(seconds, "reduce"):
         material.svbrdf = svbrdf
-        if not full_maps:
+        if not settings.full_maps:
             found = reduction.reduce(svbrdf, _part(progress, 0.96, 0.99))
             material.svbrdf, material.reduced, material.bits = found.svbrdf, found.ledger, found.bits
             material.metres_per_tile /= found.parts

@@ -1,10 +1,12 @@
 import hashlib
 import json
+import threading
 import time
 
 import cv2
 import numpy as np
 import pytest
+from material_palette.core import decomposition
 from material_palette.core.errors import Cancelled, PaletteError
 from material_palette.core.image import linear_from_srgb, srgb_from_linear
 from material_palette.core.palette import Settings, extract_palette, write_palette
@@ -128,6 +130,32 @@ def test_progress_rises_to_one_and_materials_arrive_as_they_are_done():
     )
     assert fractions == sorted(fractions) and fractions[-1] == 1
     assert sorted(m.name for m in arrived) == ["gravel", "paint", "speck"]
+
+
+def test_a_material_that_fails_behind_the_others_does_not_stop_them(monkeypatch):
+    pixels, regions = photo_and_regions()
+    again = Region("gravel again", regions[0].mask)
+    whole, calls = decomposition.decompose, []
+
+    def fails_at_first(texture, progress, decomposer):
+        calls.append(threading.current_thread())
+        if len(calls) == 1:
+            raise PaletteError("these weights can't be read")
+        return whole(texture, progress, decomposer)
+
+    monkeypatch.setattr(decomposition, "decompose", fails_at_first)
+    seen = []
+    made = extract_palette(pixels, [regions[0], again], SETTINGS, quiet, seen.append).materials
+    assert [m.error for m in made] == ["these weights can't be read", None] and seen == made
+    assert threading.main_thread() not in calls and len(calls) == 2
+
+
+def test_what_on_material_raises_ends_the_extraction():
+    def full(material):
+        raise OSError("no space left on device")
+
+    with pytest.raises(OSError, match="no space left"):
+        extract_palette(*photo_and_regions(), SETTINGS, quiet, full)
 
 
 def test_cancelling_takes_half_a_second_at_most():
