@@ -34,16 +34,17 @@ def instant(monkeypatch):
     from material_palette.core import palette
     from material_palette.core.material import SVBRDF
 
-    def extract_material(pixels, region, settings, progress, *_view_focal_engine):
+    def textured(pixels, region, settings, progress, *_view_focal_engine):
         progress(0.5, "half")
         if not region.mask.any():
             raise PaletteError(f"Region '{region.name}' is empty")
         noise = np.random.default_rng(0).random((64, 64, 1), np.float32)
         albedo = np.clip(pixels[region.mask].mean(0) * noise, 0, 1).astype(np.float32)
         svbrdf = SVBRDF(albedo, np.array([0, 0, 1], np.float32), 0.6)
-        return palette.Material(region.name, "ok", svbrdf, preview=np.ones((256, 256, 4), np.float32))
+        return palette.Material(region.name, "ok", svbrdf, preview=np.ones((256, 256, 4), np.float32)), None
 
-    monkeypatch.setattr(palette, "extract_material", extract_material)
+    monkeypatch.setattr(palette, "_textured", textured)
+    monkeypatch.setattr(palette, "_finish", lambda material, texture, settings, progress: None)
 
 
 def test_open_photo_refuses_by_name(settings, tmp_path, data_blocks):
@@ -493,14 +494,14 @@ def test_cancel_into_a_folder_leaves_no_folder(ready, endless, tmp_path):
 class Stepwise:
     """A pipeline whose second region waits until it is told to go on or to stop."""
 
-    def __init__(self, extract_material):
-        self.extract_material, self.go = extract_material, threading.Event()
+    def __init__(self, textured):
+        self.textured, self.go = textured, threading.Event()
 
     def __call__(self, pixels, region, settings, progress, *_view_focal_engine):
         while region.name == "right" and not self.go.is_set():
             progress(0.1, "waiting")
             time.sleep(0.01)
-        return self.extract_material(pixels, region, settings, progress)
+        return self.textured(pixels, region, settings, progress)
 
 
 @pytest.fixture
@@ -508,8 +509,8 @@ def stepwise(ready, instant, monkeypatch):
     """An extraction that has made its first material and waits with the second."""
     from material_palette.core import palette
 
-    steps = Stepwise(palette.extract_material)
-    monkeypatch.setattr(palette, "extract_material", steps)
+    steps = Stepwise(palette._textured)
+    monkeypatch.setattr(palette, "_textured", steps)
 
     def start():
         operator = Modal().start()
