@@ -37,7 +37,7 @@ if "material_palette" not in sys.modules:
     dev.load_package()
 from material_palette.benchmarks import charts  # noqa: E402
 from material_palette.benchmarks.records import command, commit, machine  # noqa: E402
-from material_palette.core import brdf, decomposition  # noqa: E402
+from material_palette.core import brdf, decomposition, perceptual  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.exemplar import LUMINANCE  # noqa: E402
 from material_palette.core.image import linear_from_srgb, srgb_from_linear  # noqa: E402
@@ -216,6 +216,11 @@ def flip(truth: np.ndarray, found: np.ndarray) -> float | None:
     return float(np.mean([flip_evaluator.evaluate(seen(a), seen(b), "LDR", applyMagma=False)[1] for a, b in pairs]))
 
 
+def as_picture(value: np.ndarray) -> np.ndarray:
+    """Normals (S, S, 3) or roughness (S, S) as a picture (S, S, 3) in [0, 1]."""
+    return value / 2 + 0.5 if value.ndim == 3 else np.repeat(value[..., None], 3, 2)
+
+
 def measure(material: Material, found: SVBRDF, truth: dict, with_flip: bool) -> dict:
     size = material.roughness.shape[0]
     albedo, normal = (np.broadcast_to(x, (size, size, 3)).astype(np.float32) for x in (found.albedo, found.normal))
@@ -230,6 +235,9 @@ def measure(material: Material, found: SVBRDF, truth: dict, with_flip: bool) -> 
             continue
         row[f"{key}_mse"] = float(np.mean((ours - theirs) ** 2))
         row[f"{key}_ssim"] = ssim(ours, theirs)
+        if key != "A":
+            # what squared error is blind to: whether the map looks like one of its kind
+            row[f"{key}_lpips"] = perceptual.distance(as_picture(ours), as_picture(theirs))
     small = smaller(found)
     row["delta_e"] = float(ciede2000(truth["lab"], cielab(small[0].numpy())).mean())
     if material.has_normal:
@@ -337,7 +345,7 @@ def fit_prior(training: list[Path], size: int) -> Prior:
 # ---------------------------------------------------------------- results
 
 MAPS = ("A_mse", "N_mse", "R_mse", "A_ssim", "N_ssim", "R_ssim")
-OTHERS = ("delta_e", "angle", "relit_psnr", "relit_flip")
+OTHERS = ("delta_e", "angle", "relit_psnr", "relit_flip", "N_lpips", "R_lpips")
 
 
 def summarise(results: list[dict], rows: list[str], where: Callable[[str], bool]) -> dict:
@@ -371,13 +379,14 @@ def delta(summary: dict, row: str, against: str) -> float:
 def table(summary: dict, against: str, cost: dict) -> str:
     lines = [
         "| row | A mse | N mse | R mse | A ssim | N ssim | R ssim | delta | CIEDE2000 | normals, degrees "
-        "| relit PSNR, dB | relit FLIP |" + "".join(f" {size} px: s, MB |" for size in SIZES if cost),
-        "|---" * (12 + (len(SIZES) if cost else 0)) + "|",
+        "| relit PSNR, dB | relit FLIP | N, ST-LPIPS | R, ST-LPIPS |"
+        + "".join(f" {size} px: s, MB |" for size in SIZES if cost),
+        "|---" * (14 + (len(SIZES) if cost else 0)) + "|",
     ]
     for row, found in summary.items():
         cells = [f"{found[k]['mean'] * (10 if k.endswith('mse') else 1):.3f}" for k in MAPS]
         cells.append(f"{delta(summary, row, against):+.1f} %")
-        for key, digits in zip(OTHERS, (1, 1, 1, 3), strict=True):
+        for key, digits in zip(OTHERS, (1, 1, 1, 3, 3, 3), strict=True):
             cells.append(f"{found[key]['median']:.{digits}f}" if key in found else "")
         for size in SIZES if cost else ():
             spent = cost.get(row, {}).get(str(size))
