@@ -279,15 +279,15 @@ def test_a_kept_concept_is_sampled_again_without_the_photo(ready, tmp_path, temp
 def test_an_error_asked_for_reaches_the_pipeline_and_its_outcome_is_told(ready, instant, monkeypatch):
     from material_palette.core import palette
 
-    instantly = palette.extract_material
+    instantly = palette._textured
 
     def judged(pixels, region, settings, *rest):
-        material = instantly(pixels, region, settings, *rest)
+        material, texture = instantly(pixels, region, settings, *rest)
         if settings.target_error is not None:
             material.target = {"asked": settings.target_error, "quality": "draft", "predicted": 0.12, "found": 0.1}
-        return material
+        return material, texture
 
-    monkeypatch.setattr(palette, "extract_material", judged)
+    monkeypatch.setattr(palette, "_textured", judged)
     ready.target_error = 0.15
     bpy.ops.material_palette.extract()
     assert ready.palette[0].warnings == "Error asked 0.150, predicted 0.120, found 0.100: quality draft"
