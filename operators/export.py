@@ -92,54 +92,61 @@ class MATERIAL_PALETTE_OT_export(_ExportsPalette, Operator):
             export.write_materialx(folder / f"{name}.mtlx", name, listed, tile_size, rotation)
 
 
-def adjusted_maps(material, most=None):
+def adjusted_maps(material):
     """What a material of ours looks like: (maps, tile_size, rotation, relief in metres).
 
-    most: px, the longest side of a map that is wanted, None for all there is. maps: "basecolor" (H, W, 3) linear or
-    (3,), "normal" (H, W, 3) unit vectors or None, "roughness" (H, W) or float, "metallic" float, "height" (H, W) in
-    [0, 1] or None; adjustments are in them. Raises PaletteError for a material that isn't ours.
+    maps: "basecolor" (H, W, 3) linear or (3,), "normal" (H, W, 3) unit vectors or None, "roughness" (H, W) or float,
+    "metallic" float, "height" (H, W) in [0, 1] or None; adjustments are in them. Raises PaletteError for a material
+    that isn't ours.
     """
-    from ..core.export import adjust_colour, adjust_normal
+    return adjuster(material)()
+
+
+def adjuster(material, most=None, height=True):
+    """Read `material` now; return a function without bpy, for any thread, that gives what `adjusted_maps` does.
+
+    most: px, the longest side of a map that is wanted, None for all there is. height: whether that map is wanted.
+    """
     from ..core.nodes import Controls
 
     controls = Controls(material)
     if not controls:
         raise PaletteError(f"'{material.name}' was not made by Material Palette, or its nodes were taken apart")
-    principled = controls.node("principled")
 
     def picture(kind):
         node = controls.node(kind)
         return read_map(node.image, most) if node and node.image else None
 
-    colour = picture("basecolor")
-    if colour is None:
-        colour = np.array(principled.inputs["Base Color"].default_value[:3], np.float32)
-    else:
-        colour = adjust_colour(colour, controls.hue, controls.saturation, controls.brightness)
-    normal = picture("normal")
-    if normal is not None:
-        normal = adjust_normal(normal * 2 - 1, controls.strength, controls.rotation)
-    roughness = picture("roughness")
-    if roughness is None:
-        roughness = float(principled.inputs["Roughness"].default_value)
-    else:
-        roughness = np.clip(roughness[..., 0] + controls.roughness_offset, 0, 1)
-    height = material.get("height")
-    maps = {
-        "basecolor": colour,
-        "normal": normal,
-        "roughness": roughness,
-        "metallic": float(principled.inputs["Metallic"].default_value),
-        "height": read_map(height, most)[..., 0] if height is not None else None,
-    }
-    tile_size = controls.tile_size
-    relief = material.get("height_scale", 0.0) * (tile_size or 1.0) * controls.strength
-    return maps, tile_size, controls.rotation, relief
+    maps = {kind: picture(kind) for kind in ("basecolor", "normal", "roughness")}
+    image = material.get("height") if height else None
+    maps["height"] = read_map(image, most)[..., 0] if image is not None else None
+    inputs = controls.node("principled").inputs
+    maps["metallic"] = float(inputs["Metallic"].default_value)
+    constant = np.array(inputs["Base Color"].default_value[:3], np.float32), float(inputs["Roughness"].default_value)
+    values, tile_size = controls.values(), controls.tile_size
+    relief = material.get("height_scale", 0.0) * (tile_size or 1.0) * values["strength"]
+
+    def adjust():
+        from ..core.export import adjust_colour, adjust_normal
+
+        colour, normal, roughness = (maps[kind] for kind in ("basecolor", "normal", "roughness"))
+        colours = values["hue"], values["saturation"], values["brightness"]
+        colour = constant[0] if colour is None else adjust_colour(colour, *colours)
+        if normal is not None:
+            normal = adjust_normal(normal * 2 - 1, values["strength"], values["rotation"])
+        if roughness is None:
+            roughness = constant[1]
+        else:
+            roughness = np.clip(roughness[..., 0] + values["roughness_offset"], 0, 1)
+        adjusted = {"basecolor": colour, "normal": normal, "roughness": roughness}
+        return maps | adjusted, tile_size, values["rotation"], relief
+
+    return adjust
 
 
 def read_map(image, most=None):
-    """(H, W, 3) float32, top row first: a base colour linear, other maps as stored; averaged down to sides of at most
-    `most` px."""
+    """(H, W, 3) float32, top row first: a base colour linear, other maps as stored; averaged down, as
+    stored, to sides of at most `most` px."""
     from ..core.image import linear_from_srgb
 
     width, height = image.size
@@ -148,13 +155,13 @@ def read_map(image, most=None):
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(height, width, 4)[::-1, :, :3]
-    # Blender has decoded those of more than 8 bits itself
-    if image.colorspace_settings.name == "sRGB" and not image.is_float:
-        pixels = linear_from_srgb(pixels)
     step = -(-max(width, height) // most) if most else 1
     if step > 1:
         rows, columns = height // step, width // step
         pixels = pixels[: rows * step, : columns * step].reshape(rows, step, columns, step, 3).mean((1, 3))
+    # Blender has decoded those of more than 8 bits itself
+    if image.colorspace_settings.name == "sRGB" and not image.is_float:
+        pixels = linear_from_srgb(pixels)
     return np.ascontiguousarray(pixels)
 
 

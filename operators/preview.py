@@ -9,6 +9,7 @@ import numpy as np
 from ..core.errors import PaletteError
 from ..core.nodes import Controls, preview_is_of, set_preview
 from .examine import redraw_sidebars
+from .export import adjuster
 from .setup import missing
 
 _QUIET = 0.3  # seconds without a change before a preview is drawn anew
@@ -44,16 +45,15 @@ def painter(material):
 
     Raises PaletteError for a material that isn't ours or has lost a texture.
     """
-    from .export import adjusted_maps
-
-    maps, tile_size, rotation, _relief = adjusted_maps(material, _SIDE)
-    tiles = 2.0 * material.get("metres_per_tile", 1.0) / tile_size if tile_size else 2.0
+    adjust, metres = adjuster(material, _SIDE, height=False), material.get("metres_per_tile", 1.0)
 
     def paint():
         from ..core.brdf import render_sphere
         from ..core.image import srgb_from_linear
         from ..core.material import SVBRDF
 
+        maps, tile_size, rotation, _relief = adjust()
+        tiles = 2.0 * metres / tile_size if tile_size else 2.0
         normal = maps["normal"] if maps["normal"] is not None else np.array([0, 0, 1], np.float32)
         svbrdf = SVBRDF(maps["basecolor"], normal, maps["roughness"], metallic=maps["metallic"])
         sphere = render_sphere(svbrdf, tiles=min(max(tiles, 0.1), 32.0), rotation=rotation)

@@ -78,8 +78,8 @@ def test_a_quarter_turn_turns_the_stripes(stripes):
 
 
 def test_maps_are_averaged_down(stripes):
-    from material_palette.operators.export import adjusted_maps
+    from material_palette.operators.export import adjuster
 
-    full, small = (adjusted_maps(stripes, most)[0]["roughness"] for most in (None, 4))
+    full, small = (adjuster(stripes, most)()[0]["roughness"] for most in (None, 4))
     assert small.shape == (4, 4)
     np.testing.assert_allclose(small, full.reshape(4, 4, 4, 4).mean((1, 3)), atol=1e-5)
