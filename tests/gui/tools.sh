@@ -5,8 +5,9 @@
 spot() { state "'%d %d' % (${1}[0] + ${1}[2] * $2 / 1000, ${1}[1] + ${1}[3] * $3 / 1000)"; }
 # carry X Y TO_X TO_Y: drag and drop on the screen
 carry() {
-  xdo mousemove "$1" "$2" sleep 0.5 mousedown 1 sleep 0.5 mousemove_relative 12 12 sleep 0.5
-  xdo mousemove $((($1 + $3) / 2)) $((($2 + $4) / 2)) sleep 0.5 mousemove "$3" "$4" sleep 1 mouseup 1
+  local wait=${PALETTE_PATIENCE:-1}
+  xdo mousemove "$1" "$2" sleep 0.5 mousedown 1 sleep "$wait" mousemove_relative 12 12 sleep 0.5
+  xdo mousemove $((($1 + $3) / 2)) $((($2 + $4) / 2)) sleep 0.5 mousemove "$3" "$4" sleep "$wait" mouseup 1
 }
 # the sidebar to its end
 scroll() {
@@ -40,11 +41,12 @@ again_until() {
 tell browse
 sleep 2
 at=$(find_text photo.jpg || find_text photo.ipg)
-carry $at $(spot editor 300 500)
-sleep 2
-picture drop
-key p # Blender asks: Open Images or Open Photo
-expect "photo == 'photo.jpg'" 15
+drop() {
+  carry $at $(spot editor 300 500)
+  picture drop
+  key p # Blender asks: Open Images or Open Photo
+}
+again_until "photo == 'photo.jpg'" drop
 picture dropped
 echo "paste is offered: $(state pastes)"
 
@@ -101,8 +103,8 @@ scroll
 press "Shelf to Drag From" shelf 20
 sleep 3
 picture shelf
-carry $(state "'%d %d' % (shelf[0] + 50, shelf[1] + shelf[3] / 2)") $(spot view 500 500)
-expect "cube == palette[0]" 15
+again_until "cube == palette[0]" \
+  carry $(state "'%d %d' % (shelf[0] + 50, shelf[1] + shelf[3] / 2)") $(spot view 500 500)
 picture carried
 tell one_face
 scroll
