@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What a scene needs: textures, file, seconds and memory of full and of fitted palettes, and how pictures differ.
 
-    python3 dev.py bench needs --data DATA          # about 15 minutes of one core
+    python3 dev.py bench needs --data DATA          # about 10 minutes of one core
     python3 dev.py bench needs --quick              # one small scene, from the bundled photo
 
 Three scenes of `scenes.py`, each with the palette of the bundled photo as it is extracted with --full-maps, and with
@@ -14,7 +14,6 @@ renders it as a user would. Writes needs.csv, needs.json, the chart and the pict
 
 import argparse
 import json
-import math
 import subprocess
 import sys
 import tempfile
@@ -37,11 +36,10 @@ from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_
 from material_palette.core.material import SVBRDF  # noqa: E402
 from material_palette.core.region import read_regions  # noqa: E402
 
-SIZE, GRID = (960, 540), 4  # samples along a pixel's side
-BORDER = (0.38, 0.62, 0.28, 0.52)  # what is rendered of the picture: from left to right and from below
-FILTER = 1.5  # px, width of Cycles' own pixel filter
+SIZE, GRID = (960, 540), 8  # samples along a pixel's side
+BORDER = (0.4375, 0.5625, 0.35, 0.5)  # what is rendered: from left to right and from below, whole pixels
 SUNS = (((0.6, 0.2, 0.4), 2.5), ((0.9, 0.0, -0.9), 1.2), ((0.3, -0.9, 0.0), 0.8))  # rotation, strength
-VISIBLE = (0.01, 0.02, 0.04)
+VISIBLE = (0.02, 0.03)
 EXAMPLE = ROOT / "examples" / "viaduct"
 SHIPPED = f"fitted, {reduction.VISIBLE:g}"
 COST_SAMPLES = 16
@@ -155,14 +153,14 @@ class Stage:
             with tempfile.TemporaryDirectory() as folder:
                 scene.render.filepath = str(Path(folder) / "render.exr")
                 self.bpy.ops.render.render(write_still=True)
-                pictures.append(filtered(scenes._read(scene.render.filepath)[0], grid))
+                pictures.append(reduction.filtered(scenes._read(scene.render.filepath)[0], grid))
         return [*pictures, sum(pictures)]
 
     def cost(self, folder: Path) -> tuple[float, float]:
         """CPU seconds and peak memory in MB of a process that renders the scene as it is dressed."""
         scene, path = self.bpy.context.scene, folder / "scene.blend"
         scene.render.resolution_percentage, scene.cycles.samples = 100, COST_SAMPLES
-        scene.cycles.filter_width = FILTER
+        scene.cycles.filter_width = reduction.PIXEL
         for sun in self.suns:
             sun.hide_render = False
         self.bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=False)
@@ -177,18 +175,6 @@ class Stage:
         size = path.stat().st_size
         path.unlink()
         return size
-
-
-def filtered(fine: np.ndarray, grid: int) -> np.ndarray:
-    """Pixels of a picture (H grid, W grid, 3) of samples, by the Blackman-Harris window that Cycles uses."""
-    margin = math.ceil((FILTER - 1) / 2 * grid)
-    x = (np.arange(-margin, grid + margin) - (grid - 1) / 2) / (FILTER * grid) + 0.5
-    turns = 2 * np.pi * np.clip(x, 0, 1)
-    weights = 0.35875 - 0.48829 * np.cos(turns) + 0.14128 * np.cos(2 * turns) - 0.01168 * np.cos(3 * turns)
-    kernel = (weights / weights.sum()).astype(np.float32)
-    # the window's first sample is where the pixel's own ones begin, less the margin
-    whole = cv2.sepFilter2D(fine, -1, kernel, kernel, anchor=(margin, margin), borderType=cv2.BORDER_REPLICATE)
-    return whole[::grid, ::grid]
 
 
 def measure(kind: str, number: int, name: str, materials, options, work: Path) -> list[dict]:
@@ -239,11 +225,7 @@ def measure(kind: str, number: int, name: str, materials, options, work: Path) -
         # what is left of the grid in the pictures
         stage.dress(full, work / "full")
         finer = [encoded(p, gain) for p, gain in zip(stage.render(options.grid + 1), gains, strict=True)]
-        least = tuple(min(a, b) for a, b in zip(finer[0].shape[:2], reference[0].shape[:2], strict=True))
-        floor = [
-            float(flip(a[: least[0], : least[1]], b[: least[0], : least[1]]).mean())
-            for a, b in zip(reference, finer, strict=True)
-        ]
+        floor = [float(flip(a, b).mean()) for a, b in zip(reference, finer, strict=True)]
         rows[0]["flip_to_finer_grid"] = float(np.mean(floor))
         print("to a finer grid", floor, flush=True)
     return rows
@@ -298,7 +280,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="one small scene, one palette")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    options.size, options.grid = ((480, 270), GRID) if options.quick else (SIZE, GRID)
+    options.size, options.grid = ((480, 270), 4) if options.quick else (SIZE, GRID)
     options.visible = (reduction.VISIBLE,) if options.quick else VISIBLE
     name = "needs-quick" if options.quick else "needs"
     parts = records.Parts(options.output.parent / "parts" / name, options.minutes)

@@ -37,7 +37,8 @@ VISIBLE = 0.02  # FLIP, mean over a window
 WINDOW = 128  # px, two degrees of the view
 LEAST_SIDE = 16  # px
 MOST_PARTS = 4
-TEXELS_PER_PIXEL = (0.4, 0.6, 0.85, 1.1, 1.4, 1.75, 2.3)  # tried where a scene is known
+TEXELS_PER_PIXEL = (0.5, 0.7, 1.0, 1.4, 1.75, 2.1, 2.6)  # tried where a scene is known
+PIXEL = 1.5  # px, width of a renderer's pixel filter
 SAMPLES = 4  # along a pixel's side, at most
 FAR = 0.02  # mean difference of maps that is seen without rendering them
 # (light, view), of any length: a sun from the side, a low one, and one that the viewer sees mirrored
@@ -352,8 +353,20 @@ class _Judge:
                 torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view)
             )
             shaded = shade(albedo, normal, roughness, light, view) / light[2]
-            pictures.append(srgb_from_linear(_means(shaded.clamp(0, 1).numpy(), window)))
+            pictures.append(srgb_from_linear(filtered(shaded.clamp(0, 1).numpy(), n)))
         return pictures
+
+
+def filtered(samples: np.ndarray, n: int) -> np.ndarray:
+    """Pixels (H, W, C) of samples (n H, n W, C), by the Blackman-Harris window that Cycles uses, PIXEL px wide."""
+    margin = math.ceil((PIXEL - 1) / 2 * n)
+    x = (np.arange(-margin, n + margin) - (n - 1) / 2) / (PIXEL * n) + 0.5
+    turns = 2 * np.pi * np.clip(x, 0, 1)
+    weights = 0.35875 - 0.48829 * np.cos(turns) + 0.14128 * np.cos(2 * turns) - 0.01168 * np.cos(3 * turns)
+    kernel = (weights / weights.sum()).astype(np.float32)
+    # the window begins with the pixel's own samples less the margin
+    whole = cv2.sepFilter2D(samples, -1, kernel, kernel, anchor=(margin, margin), borderType=cv2.BORDER_REPLICATE)
+    return whole[::n, ::n]
 
 
 def _texels(value: np.ndarray, corner: Sequence[int], count: int, side: int, step: int = 1) -> np.ndarray:
