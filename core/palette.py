@@ -422,7 +422,8 @@ def fit_material(
     """
     full = material.svbrdf
     with _timed(material.seconds, "fit"):
-        found = reduction.reduce(full, progress, visible, 1, max(pixels, LEAST_FITTED))
+        # of what no camera sees anything will do
+        found = reduction.reduce(full, progress, visible if pixels else 1.0, 1, max(pixels, LEAST_FITTED))
         if displaced:
             side = max(LEAST_FITTED, math.ceil(pixels * HEIGHTS_PER_PIXEL))
             found.svbrdf.height = reduction.shrink(full, side).height
