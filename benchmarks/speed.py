@@ -7,7 +7,8 @@
 Points are preset x decomposer: CPU and wall seconds per material at 1024 px (a bundled region), against the
 end-to-end error that `endtoend` has measured. Growth: resolution, regions, megapixels of the photo; each run in a
 process of its own, of which the peak memory is stated. `palette` is the command line's four materials of the bundled
-viaduct, from photo to .blend. Wall seconds mean something on an idle machine only. A run that was stopped goes on.
+viaduct, from photo to .blend; `engine` is the patch engine by itself. Wall seconds mean something on an idle machine
+only. A run that was stopped goes on.
 """
 
 import argparse
@@ -30,7 +31,9 @@ import dev  # noqa: E402
 dev.load_package()
 from material_palette.benchmarks import charts, endtoend, measures, records  # noqa: E402
 from material_palette.core import palette  # noqa: E402
-from material_palette.core.image import read_mask, read_photo  # noqa: E402
+from material_palette.core.engines import patch  # noqa: E402
+from material_palette.core.exemplar import cut_exemplar  # noqa: E402
+from material_palette.core.image import read_mask, read_photo, srgb_from_linear  # noqa: E402
 from material_palette.core.region import Region, read_regions  # noqa: E402
 
 PHOTO, REGION = "facade", "stone_wall"  # bundled
@@ -39,6 +42,8 @@ GROWTH = {  # what grows: its values, and the exponent that theory gives
     "regions": ((1, 2, 4, 8, 16, 32), 1.0, "regions of one photo, 256 px"),
     "megapixels": ((0.5, 2, 8, 24, 50), 1.0, "megapixels of the photo, 512 px"),
 }
+ENGINE = (("draft", 512, 5), ("balanced", 1024, 5), ("draft", 4096, 1))  # quality, px, runs
+SUITES = "palette", "engine", "points", "growth", "cores"
 QUICK = {"resolution": (128, 256), "regions": (1, 2), "megapixels": (0.5, 1)}
 
 
@@ -70,6 +75,27 @@ def measured(what: str, value: float, quality: str = "balanced", decomposer: str
     stages = {f"s_{stage}": round(seconds, 3) for stage, seconds in found.seconds.items()}
     peak = records.peak_mb()
     return {"cpu_seconds": cpu, "wall_seconds": wall, "peak_mb": peak, "added_mb": peak - before} | stages
+
+
+def engine_alone(quality: str, size: int, runs: int) -> dict:
+    """Medians over runs of CPU and wall seconds to learn the viaduct's masonry and sample a texture of it, the peak
+    memory, and the longest time without a call of progress."""
+    folder = ROOT / "examples" / "viaduct"
+    pixels = read_photo(folder / "photo.jpg").pixels
+    exemplar = cut_exemplar(pixels, read_mask(folder / "masks" / "masonry.png", pixels.shape[:2]))
+    encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
+    taken, calls = [], []
+
+    def progress(fraction: float, message: str) -> None:
+        calls.append(time.perf_counter())
+
+    for seed in range(runs):
+        wall, cpu = time.perf_counter(), time.process_time()
+        patch.sample(patch.learn(encoded, exemplar.mask, progress), (size, size), seed, progress, quality)
+        taken.append((time.perf_counter() - wall, time.process_time() - cpu))
+    wall, cpu = np.median(taken, 0)
+    silence = float(np.diff(calls).max())
+    return {"cpu_seconds": cpu, "wall_seconds": wall, "peak_mb": records.peak_mb(), "runs": runs, "silence": silence}
 
 
 def pieces(mask: np.ndarray, count: int) -> list[np.ndarray]:
@@ -196,17 +222,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--largest", type=int, default=4096, help="px, of the resolutions (%(default)s)")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no measurement after so long")
     parser.add_argument("--quick", action="store_true", help="the smallest values only")
-    parser.add_argument("--only", nargs="+", choices=("points", "growth", "cores", "palette"))
+    parser.add_argument("--only", nargs="+", choices=SUITES)
     parser.add_argument("--case", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.case:
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
-        print(json.dumps(measured(*json.loads(options.case))))
+        what, *case = json.loads(options.case)
+        print(json.dumps(engine_alone(*case) if what == "engine" else measured(what, *case)))
         return 0
     quick = options.quick
     parts = records.Parts(options.output.parent / "parts" / ("speed-quick" if quick else "speed"), options.minutes)
-    wanted = options.only or ("points", "growth", "cores", "palette")
+    wanted = options.only or SUITES
     size, rows, points, growth, about = 256 if quick else 1024, [], {}, {}, {}
     errors = options.errors or options.output.parent / "endtoend" / "endtoend.csv"
     errors = errors_of(errors) if errors.exists() else {}
@@ -223,6 +250,9 @@ def main(arguments: list[str] | None = None) -> int:
         if found:
             about["palette of 4 materials, 1024 px, balanced"] = found
             print(f"palette: {found['wall_seconds']:.1f} s wall, {found['cpu_seconds']:.1f} s CPU", flush=True)
+    if "engine" in wanted:
+        for quality, side, runs in ENGINE[:1] if quick else ENGINE:
+            take(f"patch engine, {quality}, {side} px", 2, "engine", quality, side, runs)
     if "points" in wanted:
         for decomposer in endtoend.DECOMPOSERS:
             for quality in ("balanced",) if quick else endtoend.QUALITIES:

@@ -97,3 +97,9 @@ def test_silent_failures_are_those_without_a_warning():
 
 def test_exponent_of_a_power():
     assert speed.exponent([256, 512, 1024, 2048], [1, 4, 16, 64]) == pytest.approx(2)
+
+
+def test_the_engine_alone_is_timed_over_runs():
+    found = speed.engine_alone("draft", 64, 2)
+    assert found["runs"] == 2 and 0 < found["silence"] < found["wall_seconds"] * 2
+    assert found["cpu_seconds"] > 0.05 and found["peak_mb"] > 50
