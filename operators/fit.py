@@ -142,11 +142,16 @@ def _share(material, full):
 
     for kind in ("basecolor", "normal", "roughness"):
         mine, theirs = (Controls(m).node(kind) for m in (material, full))
-        if mine and theirs and mine.image and theirs.image and tuple(mine.image.size) == tuple(theirs.image.size):
+        # as large is not enough: where normals get fewer texels the roughness takes over what they lose
+        if mine and theirs and mine.image and theirs.image and _same(mine.image, theirs.image):
             spare, mine.image = mine.image, theirs.image
             bpy.data.images.remove(spare)
     for name in ("concept", "concept_tensors"):
         setattr(material.material_palette, name, getattr(full.material_palette, name))
+
+
+def _same(first, second):
+    return tuple(first.size) == tuple(second.size) and np.array_equal(read_map(first), read_map(second))
 
 
 def _bytes(material):

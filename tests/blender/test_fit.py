@@ -147,3 +147,14 @@ def test_the_command_line_fits_into_another_folder(made, tmp_path, capsys):
     # the same folder would lose the full maps
     assert main([*arguments, str(made[0])]) == 2
     assert main(["fit", str(made[0]), "--scene", str(tmp_path / "none.blend"), "-o", str(tmp_path / "x")]) == 2
+
+
+def test_maps_as_large_but_not_alike_are_not_shared():
+    from material_palette.operators.fit import _same
+
+    first, second = (bpy.data.images.new(name, 8, 8, is_data=True) for name in ("first", "second"))
+    assert _same(first, second)
+    pixels = np.zeros(8 * 8 * 4, np.float32)
+    pixels[40] = 0.5
+    second.pixels.foreach_set(pixels)
+    assert not _same(first, second)
