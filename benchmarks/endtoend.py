@@ -122,6 +122,12 @@ def cast(tested: list[Known], number: int) -> dict[str, Known]:
     return {part: tested[order[(first + i) % len(tested)]] for i, part in enumerate(scenes.KINDS[kind])}
 
 
+def by_class(known: Known, every: list[Known]) -> tuple[list[Known], list[Known]]:
+    """The other materials of its class, and those of other classes."""
+    same = [m for m in every if m.kind == known.kind and m.name != known.name]
+    return same, [m for m in every if m.kind != known.kind]
+
+
 def tile_of(maps: SVBRDF, across: float) -> tuple[float, float]:
     """Metres of a tile across and up."""
     h, w = maps.albedo.shape[:2] if maps.albedo.ndim == 3 else (1, 1)
@@ -179,8 +185,7 @@ def rows_of(number, shown, part, tile, truth: Known, every, view, auto, options,
         take(f"ours, {quality}, {{}}", mask, quality, DECOMPOSERS)
     if auto is not None:
         take("ours, auto regions", auto, "balanced", DECOMPOSERS[:1])
-    same = [m for m in every if m.kind == truth.kind and m.name != truth.name]
-    other = [m for m in every if m.kind != truth.kind]
+    same, other = by_class(truth, every)
     for label, choices in (("true class", same), ("other class", other)):
         for i in range(min(2, len(choices))):
             chosen = choices[int(random.integers(len(choices)))].read()
@@ -295,18 +300,22 @@ def automatic(shown: scenes.Shown) -> tuple[dict[str, np.ndarray], dict[str, flo
 # ---------------------------------------------------------------- a scene
 
 
-def run_scene(number: int, tested, every, options, keep: Path) -> dict:
-    """All rows of all parts of one scene, and the scene rendered again with some of them."""
+def photographed(number: int, tested: list[Known], options):
+    """A scene's kind, its known materials and their maps by part, the scene dressed in them, and its photo."""
     torch.set_num_threads(1)
     kind = tuple(scenes.KINDS)[number % len(scenes.KINDS)]
     parts = cast(tested, number)
     truth = {part: known.read() for part, known in parts.items()}
-    across = scenes.KINDS[kind]
     scene = scenes.Scene(kind, number, options.size, options.samples)
-    tiles = {part: tile_of(maps, across[part]) for part, maps in truth.items()}
-    scene.dress(truth, tiles)
-    shown = scene.show()
+    scene.dress(truth, {part: tile_of(maps, scenes.KINDS[kind][part]) for part, maps in truth.items()})
+    return kind, parts, truth, scene, scene.show()
 
+
+def run_scene(number: int, tested, every, options, keep: Path) -> dict:
+    """All rows of all parts of one scene, and the scene rendered again with some of them."""
+    kind, parts, truth, scene, shown = photographed(number, tested, options)
+    across = scenes.KINDS[kind]
+    tiles = {part: tile_of(maps, across[part]) for part, maps in truth.items()}
     view = palette.rectification.look(shown.photo)
     auto, ious = automatic(shown) if options.auto else ({}, {})
     result, answers = {"kind": kind, "parts": [], "again": []}, {}
@@ -357,22 +366,16 @@ def resembling(number: int, tested, every, options) -> list[dict]:
     Rows: ours from true masks and from automatic ones; the known material itself (the least that can be asked for);
     ours against a material of another class (no resemblance at all).
     """
-    torch.set_num_threads(1)
-    kind = tuple(scenes.KINDS)[number % len(scenes.KINDS)]
-    parts, across = cast(tested, number), scenes.KINDS[kind]
-    truth = {part: known.read() for part, known in parts.items()}
-    scene = scenes.Scene(kind, number, options.size, options.samples)
-    scene.dress(truth, {part: tile_of(maps, across[part]) for part, maps in truth.items()})
-    shown = scene.show()
+    kind, parts, truth, _, shown = photographed(number, tested, options)
+    across = scenes.KINDS[kind]
     view, found = palette.rectification.look(shown.photo), []
     auto = automatic(shown)[0] if options.auto else {}
     for i, (part, mask) in enumerate(shown.masks.items()):
         random, known, tile = np.random.default_rng([number, i, 1]), parts[part], across[part]
-        alike = [m for m in every if m.kind == known.kind and m.name != known.name]
+        alike, others = by_class(known, every)
         if not alike:
             continue
         same = alike[int(random.integers(len(alike)))].read()
-        others = [m for m in every if m.kind != known.kind]
         other = others[int(random.integers(len(others)))].read()
         rows = {"the material itself": (same, Found(truth[part], truth[part].albedo.shape[1] / tile))}
         for label, region in (("true masks", mask), ("automatic", auto.get(part))):
