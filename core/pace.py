@@ -6,19 +6,31 @@ from pathlib import Path
 
 _KEPT = 200  # runs remembered
 _COUNTED = 5  # of them, the latest of a kind, decide
+_UNTIMED = 8.0  # seconds of `balanced` at 1024 px on two cores of a server; stands in until a material has been timed
+_QUALITY = {"draft": 0.75, "balanced": 1.0, "best": 2.2}  # cost beside `balanced`, as docs/results.md has it
 
 
 def expected(history: list[dict], engine: str, quality: str, resolution: int, materials: int) -> float | None:
-    """Seconds that `materials` materials will take, or None when no run of this engine and quality is remembered.
+    """Seconds that `materials` materials will take; None for an engine of which nothing can be said.
 
-    history: what `remembered` returns. Taken from the runs at the nearest resolution, by the number of pixels.
+    history: what `remembered` returns. Runs of the same quality at the nearest resolution decide, else those of another
+    quality; the engine patch is forecast even before any run, as on the machine that the benchmark of speed ran on.
     """
-    runs = [run for run in history if run["engine"] == engine and run["quality"] == quality]
-    if not runs:
-        return None
-    nearest = min((run["resolution"] for run in runs), key=lambda r: abs(r - resolution))
-    latest = [run["seconds"] for run in runs if run["resolution"] == nearest][-_COUNTED:]
-    return materials * statistics.median(latest) * (resolution / nearest) ** 2
+    runs = [run for run in history if run["engine"] == engine]
+    if engine != "patch":
+        runs = [run for run in runs if run["quality"] == quality]
+    same = [run for run in runs if run["quality"] == quality] or runs
+    if not same:
+        return materials * _UNTIMED * _cost(quality, resolution) if engine == "patch" else None
+    nearest = min((run["resolution"] for run in same), key=lambda r: abs(r - resolution))
+    latest = [run for run in same if run["resolution"] == nearest][-_COUNTED:]
+    pace = statistics.median(run["seconds"] / _cost(run["quality"], run["resolution"]) for run in latest)
+    return materials * pace * _cost(quality, resolution)
+
+
+def _cost(quality, resolution):
+    """Beside that of `balanced` at 1024 px: a part that each region takes, and one that grows with the side to 1.6."""
+    return _QUALITY.get(quality, 1.0) * (0.08 + 0.92 * (resolution / 1024) ** 1.6)
 
 
 def remembered(path: Path | None) -> list[dict]:

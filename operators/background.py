@@ -54,11 +54,11 @@ def time_left(seconds):
     return "" if seconds < 0 else f"{duration(seconds)} left"
 
 
-def duration(seconds):
-    """`seconds` as a person says it."""
-    if seconds < 60:
+def duration(seconds, brief=False):
+    """`seconds` as a person says it; brief: in whole minutes from two on."""
+    if seconds < (120 if brief else 60):
         return f"{max(1, round(seconds))} s"
-    return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
+    return f"{round(seconds / 60)} min" if brief else f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
 
 
 def cancel():

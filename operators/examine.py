@@ -12,9 +12,9 @@ from ..core.errors import PaletteError
 from .photo import read_pixels
 from .regions import read_mask_image
 
-_THUMBNAIL = 128  # px
+_THUMBNAIL = 48  # px of the photo to either side: few enough for the texture to be seen
 _QUIET = 0.4  # seconds without a change before a region is looked at again
-_LOOKED_AT = 512  # px: side of what is looked at to see whether a region is of one colour
+_LOOKED_AT = 256  # px to either side of what is looked at to see whether a region is of one colour
 
 
 @dataclass
@@ -72,7 +72,8 @@ def forget():
 
 
 def examine(settings, region):
-    """Look at a region now: an Examined without icon, and its thumbnail (h, w, 4) float32, top row first, or None."""
+    """Look at a region now: an Examined without icon, and its thumbnail, (h, w, 4) float32 sRGB-encoded, top row first,
+    transparent outside of it, or None."""
     from ..core.exemplar import cut_exemplar
     from ..core.image import linear_from_srgb
     from ..core.region import Region, check_region
@@ -86,12 +87,12 @@ def examine(settings, region):
         return Examined(warning="Its mask is not of the photo's size: paint it anew"), None
     examined, thumbnail = Examined(area=float(mask.mean())), None
     if mask.any():
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        thumbnail = _thumbnail(pixels[box], mask[box])
+        at, distance = _middle(mask)
+        box = _square(at, min(_THUMBNAIL, max(8, distance)))
+        thumbnail = np.concatenate([pixels[box] / np.float32(255), mask[box][..., None]], -1).astype(np.float32)
     try:
         check_region(Region(region.name, mask))
-        box = _middle(mask)
+        box = _square(_middle(mask)[0], _LOOKED_AT)
         if cut_exemplar(linear_from_srgb(pixels[box] / np.float32(255)), mask[box]).uniform is not None:
             examined.warning = "One colour up to the photo's noise: its material will be a constant"
     except PaletteError as error:
@@ -100,12 +101,17 @@ def examine(settings, region):
 
 
 def _middle(mask):
-    """A square within the photo around the region's innermost pixel."""
+    """Row and column of the region's innermost pixel, and its distance from the outline in px."""
     import cv2
 
     distance = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_3)[1:-1, 1:-1]
     at = np.unravel_index(distance.argmax(), distance.shape)
-    return tuple(slice(max(0, i - _LOOKED_AT // 2), i + _LOOKED_AT // 2) for i in at)
+    return at, int(distance[at])
+
+
+def _square(at, half):
+    """What of the square around a pixel can lie in the photo."""
+    return tuple(slice(max(0, i - half), i + half) for i in at)
 
 
 def _photo(image):
@@ -119,13 +125,6 @@ def _photo(image):
         _photos.clear()
         _photos[key] = np.round(encoded * 255).astype(np.uint8)
     return _photos[key]
-
-
-def _thumbnail(pixels, mask):
-    """(h, w, 4) float32 sRGB-encoded: the region's box, transparent outside of it."""
-    step = max(1, max(mask.shape) // _THUMBNAIL)
-    pixels, mask = pixels[::step, ::step], mask[::step, ::step]
-    return np.concatenate([pixels / np.float32(255), mask[..., None]], -1).astype(np.float32)
 
 
 def _look():

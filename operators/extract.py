@@ -18,7 +18,7 @@ from . import history
 from .background import BackgroundOperator
 from .palette import active_entry, put_in_palette, region_of
 from .photo import photo_focal, photo_reader
-from .preferences import diffusion_settings
+from .preferences import decomposer, diffusion_settings
 from .rectify import corners_of, measure_of
 from .regions import read_mask_image
 
@@ -250,6 +250,7 @@ def sampling(settings, seed):
         "resolution": settings.resolution,
         "scale": settings.scale,
         "seed": seed,
+        "decomposer": decomposer(bpy.context),
     }
 
 

@@ -21,9 +21,9 @@ def add(chosen, records):
     pace.remember(_path(), history)
 
 
-def expected(settings, regions):
+def expected(settings, quality, regions):
     """Seconds that extracting so many regions will take with a scene's settings; None while nothing is known."""
-    return pace.expected(_load(), settings.engine, settings.quality, settings.resolution, regions)
+    return pace.expected(_load(), settings.engine, quality, settings.resolution, regions)
 
 
 def count():

@@ -50,6 +50,19 @@ def pick_weights(context):
     return bpy.path.abspath(chosen.pick_weights) if chosen is not None else ""
 
 
+def engines(context):
+    """What there is to choose from, and what each lacks, as core.dependencies has it."""
+    chosen = preferences(context)
+    paths = (chosen.model, chosen.pick_weights, chosen.maps_by) if chosen is not None else ("", "", "")
+    return dependencies.engines(*map(bpy.path.abspath, paths), find=missing)
+
+
+def decomposer(context):
+    """What finds the maps, as core.decomposition names it."""
+    chosen = preferences(context)
+    return f"resnet101={bpy.path.abspath(chosen.maps_by)}" if chosen is not None and chosen.maps_by else "unet"
+
+
 class MATERIAL_PALETTE_preferences(AddonPreferences):
     bl_idname = PACKAGE
 
@@ -94,6 +107,12 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
         "Anything's or a file of Materialistic's; else what ships",
         subtype="FILE_PATH",
     )
+    maps_by: StringProperty(
+        name="Maps By",
+        description="Checkpoint of the network of Material Palette's authors, to find albedo, normals and roughness; "
+        "else the network that ships",
+        subtype="FILE_PATH",
+    )
     author: StringProperty(name="Author", description="Written into the assets that are made")
     licence: StringProperty(name="Licence", description="Written into the assets that are made, such as CC0")
 
@@ -105,17 +124,20 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
         column.use_property_split = True
         for name in ("quality", "resolution", "author", "licence"):
             column.prop(self, name)
-        box = layout.box()
-        box.label(text="Engines", icon="MATERIAL")
-        for name, lacking in dependencies.engines().items():
-            row = box.row()
-            row.label(text=name, icon="ERROR" if lacking else "CHECKMARK")
-            row.label(text=f"Missing: {', '.join(lacking)}" if lacking else "Ready")
-        column = box.column()
-        column.use_property_split = True
-        for name in ("model", "fetch", "concepts", "device", "pick_weights"):
-            column.prop(self, name)
+        found = engines(context)
+        for task, icon in (("Textures", "TEXTURE"), ("Regions", "SELECT_SET"), ("Maps", "NODE_MATERIAL")):
+            box = layout.box()
+            box.label(text=task, icon=icon)
+            column = box.column(align=True)
+            for engine in found:
+                if engine.task == task:
+                    _draw_engine(column, engine)
+            column = box.column()
+            column.use_property_split = True
+            for name in self._WEIGHTS[task]:
+                column.prop(self, name)
         if missing():
+            box = layout.box()
             column = box.column(align=True)
             for entry in missing():
                 column.label(text=f"{entry.module}: {entry.reason}", icon="DOT")
@@ -124,8 +146,33 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
         box = layout.box()
         box.label(text="This machine", icon="TIME")
         row = box.row()
-        row.label(text=f"{history.count()} materials timed, in {history.folder() or 'memory'}")
+        row.label(text=f"{history.count()} materials timed" if history.count() else "No material timed yet")
         row.operator("material_palette.forget_times", text="Forget")
+        if history.folder():
+            row = box.row()
+            row.label(text=str(history.folder()))
+            row.operator("wm.path_open", text="Open Folder", icon="FILE_FOLDER").filepath = str(history.folder())
+
+    _WEIGHTS = {
+        "Textures": ("model", "fetch", "concepts", "device"),
+        "Regions": ("pick_weights",),
+        "Maps": ("maps_by",),
+    }
+
+
+def _draw_engine(column, engine):
+    """Ready, or what is missing and how to get it."""
+    split = column.split(factor=0.32)
+    ready = not (engine.missing or engine.wanted)
+    split.label(text=engine.name, icon="CHECKMARK" if ready else "BLANK1")
+    row = split.row()
+    row.active = ready
+    if engine.missing:
+        modules = " ".join(entry.module for entry in engine.missing)
+        row.label(text=f"Missing: {modules.replace(' ', ', ')}")
+        row.operator("material_palette.copy_install_command", text="", icon="COPYDOWN").modules = modules
+    else:
+        row.label(text=engine.wanted or "Ready")
 
 
 class MATERIAL_PALETTE_OT_forget_times(Operator):

@@ -6,7 +6,7 @@ import os
 import bpy
 import numpy as np
 from bpy.app.handlers import persistent
-from bpy.props import BoolProperty, StringProperty
+from bpy.props import BoolProperty, IntProperty, StringProperty
 from bpy.types import Operator
 
 from ..core.errors import PaletteError
@@ -220,6 +220,34 @@ class MATERIAL_PALETTE_OT_remove_region(NeedsRegion, Operator):
         return {"FINISHED"}
 
 
+class MATERIAL_PALETTE_OT_explain_region(Operator):
+    """What is wrong with this region"""
+
+    bl_idname = "material_palette.explain_region"
+    bl_label = "Explain Region"
+    bl_options = {"INTERNAL"}
+
+    index: IntProperty(min=0)
+
+    @classmethod
+    def description(cls, context, properties):
+        return _reason(context.scene.material_palette, properties.index) or cls.__doc__
+
+    def execute(self, context):
+        settings = context.scene.material_palette
+        settings.active_region = self.index
+        self.report({"WARNING"}, _reason(settings, self.index) or "Nothing is wrong with it")
+        return {"FINISHED"}
+
+
+def _reason(settings, index):
+    from . import examine
+
+    region = settings.regions[index] if index < len(settings.regions) else None
+    seen = examine.known(region) if region else None
+    return (region.error or (seen.warning if seen else "")) if region else ""
+
+
 class MATERIAL_PALETTE_OT_remove_all_regions(NeedsRegion, Operator):
     """Remove all regions and their masks"""
 
@@ -363,6 +391,7 @@ CLASSES = (
     MATERIAL_PALETTE_OT_add_region,
     MATERIAL_PALETTE_OT_remove_region,
     MATERIAL_PALETTE_OT_remove_all_regions,
+    MATERIAL_PALETTE_OT_explain_region,
     MATERIAL_PALETTE_OT_paint_region,
     MATERIAL_PALETTE_OT_show_photo,
     MATERIAL_PALETTE_OT_import_masks,

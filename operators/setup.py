@@ -2,15 +2,16 @@
 
 import functools
 
+from bpy.props import StringProperty
 from bpy.types import Operator
 
 from ..core import dependencies
 
 
 @functools.cache
-def missing():
-    """The missing packages as a tuple, looked up once: panels ask on every redraw."""
-    return tuple(dependencies.missing())
+def missing(entries=dependencies.REQUIRED):
+    """Those of `entries` that are missing, as a tuple, looked up once: panels ask on every redraw."""
+    return tuple(dependencies.missing(entries))
 
 
 def missing_sentence():
@@ -39,15 +40,17 @@ class MATERIAL_PALETTE_OT_copy_install_command(Operator):
     bl_label = "Copy Install Command"
     bl_options = {"REGISTER"}
 
-    @classmethod
-    def poll(cls, context):
-        if missing():
-            return True
-        cls.poll_message_set("Nothing is missing")
-        return False
+    modules: StringProperty(
+        name="Packages", description="Their names; else those that nothing works without", options={"SKIP_SAVE"}
+    )
 
     def execute(self, context):
-        command = dependencies.install_command(missing())
+        named = [entry for entry in dependencies.ALL if entry.module in self.modules.split()]
+        lacking = missing(tuple(named)) if named else missing()
+        if not lacking:
+            self.report({"INFO"}, "Nothing is missing")
+            return {"CANCELLED"}
+        command = dependencies.install_command(lacking)
         context.window_manager.clipboard = command
         self.report({"INFO"}, f"Copied: {command}")
         return {"FINISHED"}

@@ -28,7 +28,7 @@ def draw_controls(layout, material):
     principled = controls.node("principled")
     column = layout.column(align=True)
     if controls.node("roughness"):
-        column.prop(adjust, "roughness_offset")
+        column.prop(adjust, "roughness_offset", text="Roughness ±")
     else:
         column.prop(principled.inputs["Roughness"], "default_value", text="Roughness")
     if controls.node("basecolor"):

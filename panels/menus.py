@@ -1,4 +1,4 @@
-"""The menu "Material Palette" in the Image Editor's Image menu and the 3D View's Object menu.
+"""The menu "Material Palette" in the Image Editor's Image menu and the 3D View's Object and Mesh menus.
 
 Blender's search (F3) finds what stands in menus, so every verb of the artist stands in one.
 """
@@ -6,8 +6,9 @@ Blender's search (F3) finds what stands in menus, so every verb of the artist st
 import bpy
 
 
-class MATERIAL_PALETTE_MT_image(bpy.types.Menu):
+class MATERIAL_PALETTE_MT_all(bpy.types.Menu):
     bl_label = "Material Palette"
+    bl_description = "From a photo to materials: photo, regions, extraction, palette"
 
     def draw(self, context):
         layout = self.layout
@@ -19,15 +20,19 @@ class MATERIAL_PALETTE_MT_image(bpy.types.Menu):
         layout.operator("material_palette.pick_region", icon="EYEDROPPER")
         layout.operator("material_palette.add_region", icon="ADD")
         layout.operator("material_palette.paint_region", icon="BRUSH_DATA")
-        layout.operator_menu_enum("material_palette.draw_region", "shape")
+        layout.operator_menu_enum("material_palette.draw_region", "shape", icon="GREASEPENCIL")
+        layout.operator("material_palette.segment", icon="MOD_EXPLODE")
         layout.menu("MATERIAL_PALETTE_MT_region")
         layout.menu("MATERIAL_PALETTE_MT_surface")
-        layout.operator("material_palette.segment", icon="MOD_EXPLODE")
         layout.separator()
         layout.operator("material_palette.preview_exemplar", icon="IMAGE_BACKGROUND")
         layout.operator("material_palette.extract", icon="MATERIAL")
-        layout.menu("MATERIAL_PALETTE_MT_palette")
         layout.operator("material_palette.restore_defaults", icon="LOOP_BACK")
+        layout.separator()
+        layout.operator("material_palette.assign", icon="CHECKMARK").mapping = "KEEP"
+        layout.operator("material_palette.assign", text="Assign and Map", icon="UV").mapping = "UNMAPPED"
+        layout.operator("material_palette.replace_material", icon="ARROW_LEFTRIGHT")
+        layout.menu("MATERIAL_PALETTE_MT_palette")
 
 
 class MATERIAL_PALETTE_MT_surface(bpy.types.Menu):
@@ -63,48 +68,25 @@ class MATERIAL_PALETTE_MT_palette(bpy.types.Menu):
         layout.operator("material_palette.export", icon="EXPORT")
 
 
-class MATERIAL_PALETTE_MT_object(bpy.types.Menu):
-    bl_label = "Material Palette"
-
-    def draw(self, context):
-        layout = self.layout
-        layout.operator("material_palette.extract", icon="MATERIAL")
-        layout.separator()
-        layout.operator("material_palette.assign", icon="CHECKMARK").mapping = "KEEP"
-        layout.operator("material_palette.assign", text="Assign and Map", icon="UV").mapping = "UNMAPPED"
-        layout.operator("material_palette.replace_material", icon="ARROW_LEFTRIGHT")
-        layout.separator()
-        layout.menu("MATERIAL_PALETTE_MT_palette")
-
-
-def _draw_image(self, context):
+def _draw(self, context):
     self.layout.separator()
-    self.layout.menu("MATERIAL_PALETTE_MT_image", icon="MATERIAL")
+    self.layout.menu("MATERIAL_PALETTE_MT_all", icon="MATERIAL")
 
 
-def _draw_object(self, context):
-    self.layout.separator()
-    self.layout.menu("MATERIAL_PALETTE_MT_object", icon="MATERIAL")
-
-
-CLASSES = (
-    MATERIAL_PALETTE_MT_surface,
-    MATERIAL_PALETTE_MT_palette,
-    MATERIAL_PALETTE_MT_image,
-    MATERIAL_PALETTE_MT_object,
-)
-_PLACES = (("IMAGE_MT_image", _draw_image), ("VIEW3D_MT_object", _draw_object))
+CLASSES = (MATERIAL_PALETTE_MT_surface, MATERIAL_PALETTE_MT_palette, MATERIAL_PALETTE_MT_all)
+# of the Image Editor, and of the 3D View in Object and in Edit Mode
+_PLACES = ("IMAGE_MT_image", "VIEW3D_MT_object", "VIEW3D_MT_edit_mesh")
 
 
 def register():
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    for menu, draw in _PLACES:
-        getattr(bpy.types, menu).append(draw)
+    for menu in _PLACES:
+        getattr(bpy.types, menu).append(_draw)
 
 
 def unregister():
-    for menu, draw in _PLACES:
-        getattr(bpy.types, menu).remove(draw)
+    for menu in _PLACES:
+        getattr(bpy.types, menu).remove(_draw)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

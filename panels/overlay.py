@@ -89,9 +89,9 @@ def _draw_square(name, fragment, view, **values):
 
     images = [key for key, value in values.items() if isinstance(value, bpy.types.Image)]
     if name not in _shaders:
-        _shaders[name] = _make_shader(gpu, fragment, images)
-    shader = _shaders[name]
-    batch = batch_for_shader(shader, "TRI_FAN", {"corner": ((0, 0), (1, 0), (1, 1), (0, 1))})
+        shader = _make_shader(gpu, fragment, images)
+        _shaders[name] = shader, batch_for_shader(shader, "TRI_FAN", {"corner": ((0, 0), (1, 0), (1, 1), (0, 1))})
+    shader, batch = _shaders[name]
     shader.bind()
     shader.uniform_float("low", view.view_to_region(0.0, 0.0, clip=False))
     shader.uniform_float("high", view.view_to_region(1.0, 1.0, clip=False))

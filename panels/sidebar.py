@@ -6,6 +6,7 @@ from bpy.types import Panel, UIList
 from ..operators import examine, history, preview
 from ..operators.background import duration, time_left
 from ..operators.palette import active_entry
+from ..operators.preferences import PACKAGE, engines
 from ..operators.regions import painted_region
 from ..operators.setup import missing
 from . import material
@@ -26,8 +27,8 @@ class MATERIAL_PALETTE_UL_regions(UIList):
         name.active = item.enabled
         name.prop(item, "name", text="", emboss=False, icon_value=seen.icon if seen else 0)
         if item.error or (seen and seen.warning):
-            row.label(text="", icon="ERROR")
-        if seen and seen.area:
+            row.operator("material_palette.explain_region", text="", icon="ERROR", emboss=False).index = index
+        elif seen and seen.area:
             area = row.row(align=True)
             area.alignment = "RIGHT"
             area.active = False
@@ -155,19 +156,21 @@ class ExtractPanel:
         column.use_property_decorate = False
         column.active = not run.running
         column.prop(settings, "engine")
-        column.prop(settings, "quality")
+        enabled = sum(region.enabled for region in settings.regions)
+        _draw_quality(column, settings, enabled)
         column.prop(settings, "resolution")
         column.prop(settings, "metres_per_tile")
+        _draw_engine_state(layout, context, settings)
         if run.running:
             _draw_progress(layout, run)
         else:
-            enabled = sum(region.enabled for region in settings.regions)
             row = layout.row(align=True)
             row.scale_y = 1.5
             row.operator("material_palette.extract", icon="MATERIAL")
             row.operator("material_palette.extract", text="", icon="RESTRICT_SELECT_OFF").only_active = True
             if enabled:
-                layout.label(text=_forecast(history.expected(settings, enabled), enabled), icon="TIME")
+                seconds = history.expected(settings, settings.quality, enabled)
+                layout.label(text=_forecast(seconds, enabled, history.count()), icon="TIME")
         if run.error:
             _draw_text(layout.box(), context, run.error, "ERROR")
 
@@ -295,9 +298,38 @@ def _draw_grid(layout, context, settings):
         grid.column()
 
 
-def _forecast(seconds, regions):
+def _draw_quality(column, settings, regions):
+    """The qualities side by side, below each how long that many regions take."""
+    column = column.column(align=True)
+    column.use_property_split = False
+    column.row(align=True).prop(settings, "quality", expand=True)
+    times = column.row(align=True)
+    times.active = False
+    for item in settings.bl_rna.properties["quality"].enum_items:
+        seconds = history.expected(settings, item.identifier, max(1, regions))
+        cell = times.row(align=True)
+        cell.alignment = "CENTER"
+        cell.label(text=duration(seconds, brief=True) if seconds else "")
+
+
+def _draw_engine_state(layout, context, settings):
+    """What the chosen engine lacks, where it isn't the one that ships."""
+    if settings.engine == "patch":
+        return
+    name = settings.bl_rna.properties["engine"].enum_items[settings.engine].name
+    engine = next((engine for engine in engines(context) if engine.name == name), None)
+    if engine is None or not (engine.missing or engine.wanted):
+        return
+    lacking = ", ".join(entry.module for entry in engine.missing)
+    _draw_text(layout, context, f"Missing: {lacking}" if lacking else engine.wanted, "ERROR")
+    layout.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = PACKAGE
+
+
+def _forecast(seconds, regions, timed):
     what = "1 region" if regions == 1 else f"{regions} regions"
-    return f"{what}: about {duration(seconds)}" if seconds else f"{what}, time not known yet"
+    if not seconds:
+        return f"{what}, time not known yet"
+    return f"{what}: about {duration(seconds)}{'' if timed else ', a guess'}"
 
 
 def _draw_progress(layout, run):

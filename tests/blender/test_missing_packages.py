@@ -92,6 +92,30 @@ def test_install_command_is_copied(extension, monkeypatch):
     import bpy
     from material_palette.operators import setup
 
-    assert not bpy.ops.material_palette.copy_install_command.poll()
-    monkeypatch.setattr(setup, "missing", lambda: (dependencies.REQUIRED[-1],))
+    assert bpy.ops.material_palette.copy_install_command() == {"CANCELLED"}
+    monkeypatch.setattr(setup, "missing", lambda entries=dependencies.REQUIRED: entries[-1:])
     assert bpy.ops.material_palette.copy_install_command() == {"FINISHED"}
+    assert bpy.ops.material_palette.copy_install_command(modules="onnxruntime") == {"FINISHED"}
+
+
+def test_engines_say_what_they_lack_and_what_is_to_be_chosen(tmp_path):
+    def found(lacking, **chosen):
+        def find(entries):
+            return [entry for entry in entries if entry.module in lacking]
+
+        listed = dependencies.engines(**chosen, find=find)
+        return {engine.name: ([entry.module for entry in engine.missing], bool(engine.wanted)) for engine in listed}
+
+    bare = found({"diffusers", "onnxruntime"})
+    assert bare["Patch"] == bare["U-Net"] == bare["Auto Segment and Pick"] == ([], False)
+    assert bare["Diffusion"] == (["diffusers"], True)
+    assert bare["Segment Anything"] == bare["Materialistic"] == bare["ResNet-101"] == ([], True)
+    without_torch = found({"torch"})
+    assert without_torch["Patch"] == (["torch"], False) and without_torch["Auto Segment and Pick"] == ([], False)
+    for name in ("mobile_encoder.onnx", "mobile_decoder.onnx", "model.ckpt"):
+        (tmp_path / name).touch()
+    chosen = found({"onnxruntime"}, model="sd.safetensors", pick=str(tmp_path), maps=str(tmp_path / "model.ckpt"))
+    assert chosen["Segment Anything"] == (["onnxruntime"], False)
+    assert chosen["Materialistic"] == ([], True)
+    assert chosen["ResNet-101"] == chosen["Diffusion"] == ([], False)
+    assert found(set(), pick=str(tmp_path / "model.ckpt"))["Materialistic"] == ([], False)

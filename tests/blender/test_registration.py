@@ -22,7 +22,13 @@ def registered():
     }
     for name in HANDLERS:
         found[name] = list(getattr(bpy.app.handlers, name))
-    for name in ("TOPBAR_MT_editor_menus", "STATUSBAR_HT_header", "IMAGE_MT_image", "VIEW3D_MT_object"):
+    for name in (
+        "TOPBAR_MT_editor_menus",
+        "STATUSBAR_HT_header",
+        "IMAGE_MT_image",
+        "VIEW3D_MT_object",
+        "VIEW3D_MT_edit_mesh",
+    ):
         draw = getattr(bpy.types, name).draw
         ours = (function.__module__ for function in getattr(draw, "_draw_funcs", ()))
         found[name] = [module for module in ours if not module.startswith("bl_ui")]
@@ -101,8 +107,9 @@ def test_search_finds_every_verb(extension):
         def separator(self):
             pass
 
-    for menu in (menus.MATERIAL_PALETTE_MT_image, menus.MATERIAL_PALETTE_MT_object):
-        menu.draw(SimpleNamespace(layout=Layout()), bpy.context)
+    for place in ("IMAGE_MT_image", "VIEW3D_MT_object", "VIEW3D_MT_edit_mesh"):
+        assert menus._draw in getattr(bpy.types, place).draw._draw_funcs
+    menus._draw(SimpleNamespace(layout=Layout()), bpy.context)
     verbs = {
         cls.bl_idname
         for cls in bpy.types.Operator.__subclasses__()

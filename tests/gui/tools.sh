@@ -88,8 +88,7 @@ key ctrl+z
 expect "brightness == 1 and abs(seen - $before) < 0.02" 30
 
 # the search finds what stands in menus
-key F3
-sleep $((2 * ${PALETTE_PATIENCE:-1})) # keys before it is there would be Blender's shortcuts
+popped F3 # keys before it is there would be Blender's shortcuts
 xdo type --delay 80 "palette restore"
 sleep 2
 picture search

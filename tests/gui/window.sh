@@ -37,6 +37,19 @@ press() {
   done
   expect "$2" 1
 }
+# popped KEY...: press keys and wait until they have changed the middle of the screen
+popped() {
+  local before i
+  before=$(middle)
+  key "$@"
+  for ((i = 0; i < 60 * ${PALETTE_PATIENCE:-1}; i++)); do
+    sleep 0.5
+    if [ "$(middle)" != "$before" ]; then sleep 1; return 0; fi
+  done
+  echo "nothing popped up after $*" >&2
+  return 1
+}
+middle() { xc bash -c 'import -window root -crop 300x200+550+450 rgb:- | md5sum'; }
 # at X Y: pixel of the screen for a place in the photo, in thousandths of its width and height
 at() { python3 - "$PALETTE_STATE" "$1" "$2" <<'PY'
 import json, sys
