@@ -188,7 +188,7 @@ class MATERIAL_PALETTE_OT_save_library(_ExportsPalette, Operator):
     def invoke(self, context, event):
         photo = context.scene.material_palette.photo
         self.name = f"{os.path.splitext(photo.name)[0]} palette" if photo else "palette"
-        return context.window_manager.invoke_props_dialog(self)
+        return context.window_manager.invoke_props_dialog(self, confirm_text="Save")
 
     def execute(self, context):
         from ..core import nodes

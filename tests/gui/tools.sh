@@ -1,42 +1,6 @@
 # Sourced once the window is ready: what the artist's story leaves out, each tool once, with the mouse.
 . "$PALETTE_STORIES/window.sh"
 
-# spot NAME X Y: pixel of the screen at thousandths of the rectangle NAME of the state
-spot() { state "'%d %d' % (${1}[0] + ${1}[2] * $2 / 1000, ${1}[1] + ${1}[3] * $3 / 1000)"; }
-# carry X Y TO_X TO_Y: drag and drop on the screen
-carry() {
-  local wait=${PALETTE_PATIENCE:-1}
-  xdo mousemove "$1" "$2" sleep 0.5 mousedown 1 sleep "$wait" mousemove_relative 12 12 sleep 0.5
-  xdo mousemove $((($1 + $3) / 2)) $((($2 + $4) / 2)) sleep 0.5 mousemove "$3" "$4" sleep "$wait" mouseup 1
-}
-# the sidebar to its end
-scroll() {
-  xdo mousemove $(spot sidebar 400 700) sleep 0.5 click --repeat 40 --delay 40 5
-  sleep 2
-}
-# type TEXT into the field right of the label LABEL of the sidebar
-fill() {
-  local x y w h left
-  read -r left y <<<"$(find_text "$1" IMAGE_EDITOR UI)"
-  read -r x _ w h <<<"$(state "' '.join(map(str, sidebar))")"
-  xdo mousemove $((x + w * 2 / 3)) "$y" sleep 0.3 click --repeat 2 --delay 60 1 sleep 0.5
-  key ctrl+a
-  xdo type --delay 80 "$2"
-  key Return
-}
-
-# again_until CONDITION COMMAND...: what a busy machine has lost is done again
-again_until() {
-  local tries condition=$1
-  shift
-  for tries in 1 2; do
-    "$@"
-    if expect "$condition" 8 quietly; then return 0; fi
-  done
-  "$@"
-  expect "$condition" 15
-}
-
 # a photo dropped from Blender's file browser
 tell browse
 sleep 2
@@ -88,7 +52,7 @@ key ctrl+z
 expect "brightness == 1 and abs(seen - $before) < 0.02" 30
 
 # the search finds what stands in menus
-popped F3 # keys before it is there would be Blender's shortcuts
+popped key F3 # keys before it is there would be Blender's shortcuts
 xdo type --delay 80 "palette restore"
 sleep 2
 picture search

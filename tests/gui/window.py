@@ -1,4 +1,4 @@
-"""Runs inside Blender's window for the stories artist and tools: reports what the clicks outside have made.
+"""Runs inside Blender's window for the stories artist, tools and library: reports what the clicks outside have made.
 
 Environment: PALETTE_PHOTO, PALETTE_STATE (a JSON file, rewritten twice a second: what the data holds). A file
 PALETTE_STATE.do holds the name of a function below to be called.
@@ -134,6 +134,10 @@ def choose_tab():
     area.tag_redraw()
 
 
+def bare_cube():
+    bpy.data.objects["Cube"].data.materials.clear()
+
+
 def one_face():
     """Edit Mode with one face selected."""
     cube = bpy.data.objects["Cube"]
@@ -153,6 +157,82 @@ def leave_edit_mode():
     region = next(region for region in area.regions if region.type == "WINDOW")
     with bpy.context.temp_override(window=blender_gui.window(), area=area, region=region):
         bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def two_regions():
+    """The wall stays out; one of the others is of one colour."""
+    with editor():
+        bpy.ops.material_palette.open_photo(filepath=os.environ["PALETTE_PHOTO"])
+        bpy.ops.material_palette.import_masks(directory=os.environ["PALETTE_MASKS"])
+        bpy.ops.image.view_all(fit_view=True)
+    settings = palette()
+    settings.quality, settings.resolution, settings.author, settings.licence = "draft", 64, "An Artist", "CC0"
+    settings.regions[2].enabled = False
+    bpy.ops.ed.undo_push(message="Regions")
+
+
+def show_preferences():
+    """The large area becomes the preferences, open at the extension."""
+    import addon_utils
+
+    name = "bl_ext.user_default.material_palette"
+    info = next(addon_utils.module_bl_info(m) for m in addon_utils.modules(refresh=False) if m.__name__ == name)
+    info["show_expanded"] = True
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = info["name"]
+    blender_gui.find_area("IMAGE_EDITOR").type = "PREFERENCES"
+
+
+def hide_preferences():
+    blender_gui.find_area("PREFERENCES").type = "IMAGE_EDITOR"
+    blender_gui.show_tab("IMAGE_EDITOR", "Palette")
+
+
+def diffusion():
+    palette().engine = "diffusion"
+
+
+def patch():
+    palette().engine = "patch"
+
+
+def add_library():
+    """An asset library, a folder to export to, and file browsers within the window."""
+    for name in ("library", "exported"):
+        os.makedirs(f"{STATE}.{name}", exist_ok=True)
+        for root, _, files in os.walk(f"{STATE}.{name}"):
+            for file in files:
+                os.remove(os.path.join(root, file))
+    bpy.context.preferences.filepaths.asset_libraries.new(name="Mine", directory=f"{STATE}.library")
+    bpy.context.preferences.view.filebrowser_display_type = "SCREEN"
+
+
+def choose_folder():
+    """Where the file browser that is open looks."""
+    space = blender_gui.find_area("FILE_BROWSER").spaces.active
+    space.params.directory = f"{STATE}.exported".encode()
+
+
+def browse_assets():
+    """The properties become an Asset Browser with the assets of this file."""
+    blender_gui.find_area("PROPERTIES").ui_type = "ASSETS"
+    bpy.app.timers.register(enter_file, first_interval=1.0)
+
+
+def enter_file():
+    space = blender_gui.find_area("FILE_BROWSER").spaces.active
+    if space.params is None:  # not drawn yet
+        return 0.5
+    space.params.asset_library_reference = "LOCAL"
+    return None
+
+
+def files(name):
+    """What lies in a folder beside the state, however deep."""
+    folder = f"{STATE}.{name}"
+    return sorted(
+        os.path.relpath(os.path.join(root, file), folder) for root, _, found in os.walk(folder) for file in found
+    )
 
 
 def brightness_of_preview(material):
@@ -258,6 +338,9 @@ def report():
         "sidebar": rectangle("VIEW_3D", "UI") or rectangle("IMAGE_EDITOR", "UI"),
         "view": rectangle("VIEW_3D", "WINDOW"),
         "shelf": rectangle("VIEW_3D", "ASSET_SHELF"),
+        "library": files("library"),
+        "exported": files("exported"),
+        "engine": settings.engine,
         "modal": [operator.bl_idname for operator in blender_gui.window().modal_operators],
         "temporary": sorted(name for name in os.listdir(bpy.app.tempdir) if name.startswith("material_palette_")),
     }
