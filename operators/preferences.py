@@ -63,6 +63,17 @@ def decomposer(context):
     return f"resnet101={bpy.path.abspath(chosen.maps_by)}" if chosen is not None and chosen.maps_by else "unet"
 
 
+_WEIGHTS = {"Textures": ("model", "fetch", "concepts", "device"), "Regions": ("pick_weights",), "Maps": ("maps_by",)}
+_EMPTY = {  # what an empty field means
+    "author": "Of the photos",
+    "licence": "Of the photos, such as CC0",
+    "model": "None: a folder, a .safetensors file or a hub id",
+    "concepts": "The extension's own folder",
+    "pick_weights": "What ships",
+    "maps_by": "The network that ships",
+}
+
+
 class MATERIAL_PALETTE_preferences(AddonPreferences):
     bl_idname = PACKAGE
 
@@ -123,7 +134,7 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
         column = box.column()
         column.use_property_split = True
         for name in ("quality", "resolution", "author", "licence"):
-            column.prop(self, name)
+            column.prop(self, name, placeholder=_EMPTY.get(name, ""))
         found = engines(context)
         for task, icon in (("Textures", "TEXTURE"), ("Regions", "SELECT_SET"), ("Maps", "NODE_MATERIAL")):
             box = layout.box()
@@ -134,8 +145,8 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
                     _draw_engine(column, engine)
             column = box.column()
             column.use_property_split = True
-            for name in self._WEIGHTS[task]:
-                column.prop(self, name)
+            for name in _WEIGHTS[task]:
+                column.prop(self, name, placeholder=_EMPTY.get(name, ""))
         if missing():
             box = layout.box()
             column = box.column(align=True)
@@ -153,12 +164,6 @@ class MATERIAL_PALETTE_preferences(AddonPreferences):
             row.label(text=str(history.folder()))
             row.operator("wm.path_open", text="Open Folder", icon="FILE_FOLDER").filepath = str(history.folder())
 
-    _WEIGHTS = {
-        "Textures": ("model", "fetch", "concepts", "device"),
-        "Regions": ("pick_weights",),
-        "Maps": ("maps_by",),
-    }
-
 
 def _draw_engine(column, engine):
     """Ready, or what is missing and how to get it."""
@@ -166,13 +171,14 @@ def _draw_engine(column, engine):
     ready = not (engine.missing or engine.wanted)
     split.label(text=engine.name, icon="CHECKMARK" if ready else "BLANK1")
     row = split.row()
-    row.active = ready
+    said = row.row()
+    said.active = ready
+    said.label(
+        text=f"Missing: {', '.join(e.module for e in engine.missing)}" if engine.missing else engine.wanted or "Ready"
+    )
     if engine.missing:
-        modules = " ".join(entry.module for entry in engine.missing)
-        row.label(text=f"Missing: {modules.replace(' ', ', ')}")
-        row.operator("material_palette.copy_install_command", text="", icon="COPYDOWN").modules = modules
-    else:
-        row.label(text=engine.wanted or "Ready")
+        copy = row.operator("material_palette.copy_install_command", text="", icon="COPYDOWN")
+        copy.modules = " ".join(entry.module for entry in engine.missing)
 
 
 class MATERIAL_PALETTE_OT_forget_times(Operator):

@@ -119,3 +119,28 @@ def test_engines_say_what_they_lack_and_what_is_to_be_chosen(tmp_path):
     assert chosen["Materialistic"] == ([], True)
     assert chosen["ResNet-101"] == chosen["Diffusion"] == ([], False)
     assert found(set(), pick=str(tmp_path / "model.ckpt"))["Materialistic"] == ([], False)
+
+
+def test_the_preferences_name_every_engine_and_field(extension):
+    from types import SimpleNamespace
+
+    import bpy
+    from material_palette.operators import preferences
+
+    said = set()
+
+    class Layout:
+        def __getattr__(self, name):
+            def call(*arguments, **keywords):
+                said.update(arguments[1:2] if name == "prop" else [keywords.get("text")])
+                return Layout()
+
+            return call
+
+        def __setattr__(self, name, value):
+            pass
+
+    preferences.MATERIAL_PALETTE_preferences.draw(SimpleNamespace(layout=Layout()), bpy.context)
+    assert {engine.name for engine in dependencies.engines()} <= said
+    fields = set(preferences.MATERIAL_PALETTE_preferences.__annotations__)
+    assert fields and fields <= said
