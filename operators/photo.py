@@ -237,17 +237,21 @@ class MATERIAL_PALETTE_FH_photo(bpy.types.FileHandler):
 
 
 class MATERIAL_PALETTE_OT_restore_defaults(Operator):
-    """Set quality, resolution, seed and the other settings of extraction back to their defaults"""
+    """Set quality, resolution, seed and the other settings of extraction back to the defaults, those of the preferences
+    among them"""
 
     bl_idname = "material_palette.restore_defaults"
     bl_label = "Restore Defaults"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context):
+        from .preferences import apply_defaults
+
         settings = context.scene.material_palette
         for prop in settings.bl_rna.properties:
             if prop.type not in {"POINTER", "COLLECTION"} and prop.identifier not in _KEPT:
                 settings.property_unset(prop.identifier)
+        apply_defaults(context, settings)
         return {"FINISHED"}
 
 

@@ -190,6 +190,7 @@ def hide_preferences():
 
 def diffusion():
     palette().engine = "diffusion"
+    blender_gui.find_area("IMAGE_EDITOR").tag_redraw()
 
 
 def patch():

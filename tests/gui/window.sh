@@ -81,7 +81,7 @@ carry() {
 }
 # the sidebar to its end
 scroll() {
-  xdo mousemove $(spot sidebar 400 700) sleep 0.5 click --repeat 40 --delay 40 5
+  xdo mousemove $(spot sidebar 300 400) sleep 0.5 click --repeat 40 --delay 40 5
   sleep 2
 }
 # type TEXT into the field right of the label LABEL of the sidebar
