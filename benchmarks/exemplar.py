@@ -143,13 +143,7 @@ def photograph(
         mask &= inverse > 0.06
         point = ray / np.maximum(inverse, 0.06)[..., None] - [0, 0, 1]
         at = point @ axes.T * focal * density
-        change = (
-            max(np.hypot(*np.moveaxis(np.gradient(at, axis=a), -1, 0)) for a in (0, 1))
-            if False
-            else np.maximum(
-                np.linalg.norm(np.gradient(at, axis=0), axis=-1), np.linalg.norm(np.gradient(at, axis=1), axis=-1)
-            )
-        )
+        change = np.maximum(*(np.linalg.norm(np.gradient(at, axis=axis), axis=-1) for axis in (0, 1)))
         depth = np.clip(np.log2(np.maximum(change / SAMPLES, 1e-3)), 0, len(levels) - 1.001)
         for k in range(int(depth.min()), int(depth.max()) + 2):
             weight = np.maximum(0, 1 - np.abs(depth - k)).astype(np.float32)[..., None]
@@ -260,10 +254,13 @@ def read_textures(data: Path) -> list[Texture]:
     return found
 
 
-def run(textures: list[Texture], families: list[str], side: int, slow: int, path: Path, limit: float) -> list[dict]:
+def run(
+    textures: list[Texture], families: list[str], every: int, side: int, slow: int, path: Path, limit: float
+) -> list[dict]:
     """Rows of the CSV at `path`, which is added to: a case that stands there is not run again.
 
-    slow: of so many textures the slow measures are taken too; limit: seconds after which no case is begun.
+    every: one texture of so many takes part; slow: of so many of these the slow measures are taken too; limit: seconds
+    after which no case is begun.
     """
     rows = []
     if path.exists():
@@ -271,9 +268,9 @@ def run(textures: list[Texture], families: list[str], side: int, slow: int, path
             rows = list(csv.DictReader(file))
     done = {(row["family"], float(row["severity"]), row["texture"]) for row in rows}
     start = time.monotonic()
-    cases = [
-        (name, severity, i) for i in range(len(textures)) for name in families for severity in FAMILIES[name].severities
-    ]
+    chosen = range(0, len(textures), every)
+    measured = set(chosen[:: max(1, len(chosen) // slow)]) if slow else set()
+    cases = [(name, severity, i) for i in chosen for name in families for severity in FAMILIES[name].severities]
     # in an order that gives all severities and all textures a share of a run that is stopped
     order = np.random.default_rng(0).permutation(len(cases))
     for name, severity, i in (cases[k] for k in order):
@@ -282,7 +279,7 @@ def run(textures: list[Texture], families: list[str], side: int, slow: int, path
             continue
         family = FAMILIES[name]
         photo = family.make(texture, severity, np.random.default_rng([i, int(severity)]), side)
-        judged = family.judge(photo, texture, i % max(1, len(textures) // max(slow, 1)) == 0 and slow > 0)
+        judged = family.judge(photo, texture, i in measured)
         judged = {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in judged.items()}
         rows.append({"family": name, "severity": severity, "texture": texture.name, "kind": texture.kind} | judged)
         columns = list(dict.fromkeys(key for row in rows for key in row))
@@ -345,21 +342,22 @@ def write_chart(summary: dict, folder: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, metavar="DATA", help="folder with INDEX.csv and pbr/")
-    parser.add_argument("--quick", action="store_true", help="every third texture, small photos, no synthesis")
+    parser.add_argument("--quick", action="store_true", help="the same as --every 3 --side 448 --slow 0")
+    parser.add_argument("--every", type=int, default=0, metavar="N", help="one texture of N takes part (1)")
     parser.add_argument("--families", nargs="+", choices=list(FAMILIES), default=list(FAMILIES), metavar="NAME")
-    parser.add_argument("--side", type=int, default=0, help="px of the photos (1000; quick 448)")
-    parser.add_argument("--slow", type=int, default=8, help="textures that are synthesised too (8; quick 0)")
+    parser.add_argument("--side", type=int, default=0, help="px of the photos (1000)")
+    parser.add_argument("--slow", type=int, default=8, metavar="N", help="textures that are synthesised too, about (8)")
     parser.add_argument("--minutes", type=float, default=1e6, help="stop after; the next call goes on")
     parser.add_argument("-o", "--output", type=Path, required=True)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    textures = read_textures(options.data)[:: 3 if options.quick else 1]
+    textures, every = read_textures(options.data), options.every or (3 if options.quick else 1)
     side, slow = options.side or (448 if options.quick else 1000), 0 if options.quick else options.slow
     options.output.mkdir(parents=True, exist_ok=True)
     start = time.time()
     path = options.output / "exemplar.csv"
-    rows = run(textures, options.families, side, slow, path, 60 * options.minutes)
+    rows = run(textures, options.families, every, side, slow, path, 60 * options.minutes)
     summary = summarise(rows)
     command = ["DATA" if a == str(options.data) else a for a in arguments or sys.argv[1:]]
     facts = {
