@@ -4,14 +4,16 @@ Claim: with x the logarithm of the pixels, light adds to the texture, and two ki
 
     x(p) = texture(p) + slow(p) + s m(p)
 
-slow is a quadratic trend and what a wide blur leaves of the rest. A cast shadow is a step s per channel under a matte
-m. Any texture has some best division into a light and a dark class; it is a shadow when the step is the same all along
-their border (a stone or a stain ends differently everywhere) and turns no colour but a little towards blue, since what
-lights a shadow is the sky. The matte's slope is the border's mean profile; where the balance is unsure, it is said.
+slow is a polynomial of up to four degrees, each as far as it exceeds what the texture's own unevenness makes of one,
+which the scatter of the means of blocks about the polynomial tells. Light is nearly grey: a change of colour has to be
+clearer than one of brightness before it is taken for light. A cast shadow is a step s per channel under a matte m. Any
+texture has some best division into a light and a dark class; it is a shadow when the step is the same all along their
+border (a stone or a stain ends differently everywhere) and turns no colour but a little towards blue, since what lights
+a shadow is the sky. The matte's slope is the border's mean profile; where the balance is unsure, it is said.
 
-Sources: Oppenheim et al. 1968 (homomorphic filtering); Knutsson and Westin 1993 (normalised convolution); Finlayson et
-al. 2006 (log chromaticity of shadows); Guo, Dai and Hoiem 2011 (equal texture on both sides); Merriman, Bence and Osher
-1992 (threshold dynamics).
+Sources: Oppenheim et al. 1968 (homomorphic filtering); James and Stein 1961 (shrinkage); Knutsson and Westin 1993
+(normalised convolution); Finlayson et al. 2006 (log chromaticity of shadows); Guo, Dai and Hoiem 2011 (equal texture on
+both sides); Merriman, Bence and Osher 1992 (threshold dynamics).
 """
 
 from collections.abc import Callable
@@ -23,8 +25,12 @@ import numpy as np
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec.709
 DARKEST = 1e-3  # linear; keeps the logarithm of black finite
 GRID = 192  # px: longest side of the grid on which light is looked for
-SMOOTHNESS = 0.3  # sigma of what counts as slow, in sides of the square with the region's area
-LEAST_SIGMA = 12.0  # px
+BLOCKS = 8  # along a side of the square with the region's area, whose means are compared
+LEAST_BLOCK = 12.0  # px
+OPPONENT = np.stack([LUMINANCE, np.float32([1, -1, 0]), np.float32([0, -1, 1])])  # luminance, two of colour
+# F, the variance that a degree explains over what the blocks' scatter would; below these it is the texture's
+LEAST_F = np.array([3.0, 10.0, 10.0])  # as OPPONENT
+LEAST_F_HIGH = LEAST_F * 8 / 3  # of the third and fourth degree, such as a lamp's pool
 # of a shadow; read off the training materials, shadows and two-tone surfaces
 LEAST_STEP = 0.2  # of log luminance
 SOFTEST = 0.032  # sides: sigma of a border; softer ones are slow changes
@@ -65,14 +71,12 @@ def find_light(
     """
     h, w = mask.shape
     grid, inside, scale = reduce_to_grid(np.log(np.maximum(pixels, DARKEST)), mask)
-    side = float(np.sqrt(inside.sum()))
     progress(0.1)
     shadow = _find_shadow(grid, inside, lambda fraction: progress(0.1 + 0.7 * fraction))
     cast = (
         np.zeros_like(grid) if shadow is None else shadow.step * (_matte(shadow.distance, shadow.sigma) - 1)[..., None]
     )
-    slow = _slow(grid - cast, inside, max(LEAST_SIGMA / scale, SMOOTHNESS * side))
-    slow -= slow[inside].mean(0)
+    slow = _slow(grid - cast, inside, scale)
     # beyond a thin region its trend goes anywhere
     slow = np.clip(slow, slow[inside].min(0), slow[inside].max(0))
     whole = cv2.resize(slow, (w, h), interpolation=cv2.INTER_LINEAR)
@@ -121,10 +125,10 @@ def masked_blur(x: np.ndarray, inside: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _polynomial(shape: tuple[int, int], degree: int) -> np.ndarray:
-    """(h, w, 1, 3 or 6) terms up to degree 0, 1 or 2."""
+    """(h, w, T) terms up to a degree: 1, 3, 6, 10 or 15."""
     h, w = shape
     v, u = np.mgrid[-1 : 1 : h * 1j, -1 : 1 : w * 1j].astype(np.float32)
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v][: (1, 3, 6)[degree]], -1)
+    return np.stack([u ** (d - k) * v**k for d in range(degree + 1) for k in range(d + 1)], -1)
 
 
 def _fit(terms: np.ndarray, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
@@ -135,13 +139,32 @@ def _fit(terms: np.ndarray, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
     return np.linalg.solve(a.T @ a + ridge, a.T @ x[inside]).astype(np.float32)
 
 
-def _slow(x: np.ndarray, inside: np.ndarray, sigma: float) -> np.ndarray:
-    """A blur alone would flatten ramps towards the border; a trend alone misses a lamp's pool."""
-    terms = _polynomial(inside.shape, 2)
-    trend = terms @ _fit(terms, x, inside)
-    # the darkest and brightest pixels are joints, holes and highlights, not illumination
-    rest = np.clip(x - trend, *np.percentile((x - trend)[inside], (5, 95), axis=0))
-    return trend + masked_blur(rest, inside, sigma)
+def _slow(x: np.ndarray, inside: np.ndarray, scale: float) -> np.ndarray:
+    """Slow changes (h, w, 3), of mean 0 inside, of x (h, w, 3) on cells of `scale` px."""
+    area = int(inside.sum())
+    blocks = int(np.clip(np.sqrt(area) * scale / LEAST_BLOCK, 2, BLOCKS))
+    degree = 4 if blocks == BLOCKS else 2
+    terms = _polynomial(inside.shape, degree).astype(np.float64)
+    # orthonormal over the region, the lower degrees first
+    triangle = np.linalg.qr(terms[inside], mode="r")
+    terms = terms @ np.linalg.pinv(triangle)
+    y = x[inside] @ OPPONENT.T.astype(np.float64)
+    weights = terms[inside].T @ y
+    rest = y - terms[inside] @ weights
+    # independent blocks of that scatter would give each coefficient this variance
+    v, u = np.nonzero(inside)
+    side = np.sqrt(area) / blocks
+    _, block = np.unique((v // side).astype(int) * GRID + (u // side).astype(int), return_inverse=True)
+    count = np.bincount(block)
+    mean = np.stack([np.bincount(block, channel) for channel in rest.T], -1) / count[:, None]
+    variance = (count[:, None] * mean**2).sum(0) / max(area / side**2 - terms.shape[-1], 1)
+    slow = np.zeros(inside.shape + (3,))
+    for d in range(1, degree + 1):
+        own = slice(d * (d + 1) // 2, (d + 1) * (d + 2) // 2)
+        f = (weights[own] ** 2).mean(0) / np.maximum(variance, 1e-12)
+        kept = np.maximum(0, 1 - (LEAST_F if d < 3 else LEAST_F_HIGH) / np.maximum(f, 1e-12))
+        slow += terms[..., own] @ (weights[own] * kept)
+    return (slow @ np.linalg.inv(OPPONENT.astype(np.float64)).T).astype(np.float32)
 
 
 # ---------------------------------------------------------------- cast shadows

@@ -111,6 +111,31 @@ def test_bricks_under_a_shadow_lose_the_shadow_and_keep_their_joints():
     assert abs(contrast(exemplar.pixels) / contrast(flat) - 1) < 0.05
 
 
+def uneven(seed):
+    """A texture that is uneven at every scale, in brightness and in colour."""
+    random = np.random.default_rng(seed)
+    x = np.zeros((SIDE, SIDE, 3), np.float32)
+    for sigma in (3, 6, 12, 24):
+        noise = cv2.GaussianBlur(random.standard_normal(x.shape).astype(np.float32), (0, 0), sigma)
+        x += 0.1 * noise / noise.std()
+    return (0.2 * np.exp(x)).astype(np.float32)
+
+
+def test_the_textures_own_unevenness_is_no_light():
+    changes = [np.log(find_light(uneven(seed), everywhere()).shading).std() for seed in range(6)]
+    assert np.median(changes) < 0.02  # a trend as it comes takes 0.05
+
+
+def test_a_pool_of_light_is_taken_out_and_colour_that_wanders_is_kept():
+    flat = texture()
+    v, u = np.mgrid[-1 : 1 : SIDE * 1j, -1 : 1 : SIDE * 1j]
+    pool = np.log1p(2 * np.exp(-((u - 0.2) ** 2 + (v + 0.1) ** 2) / 0.5))[..., None].astype(np.float32)
+    found = np.log(find_light(flat * np.exp(pool), everywhere()).shading)
+    left = found - pool
+    assert (left - left.mean((0, 1))).std() < 0.3 * pool.std()
+    assert np.ptp(found, axis=-1).max() < 0.02
+
+
 def test_shading_times_exemplar_is_the_photo():
     photo = photographed(texture() * under(half()))
     exemplar = cut_exemplar(photo, everywhere())

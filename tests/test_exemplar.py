@@ -19,7 +19,7 @@ def test_a_ramp_of_light_is_taken_out_and_the_texture_kept():
         return x[:, :60].mean() / x[:, -60:].mean()
 
     assert halves(flat * ramp) > 1.8
-    assert abs(halves(found) / halves(flat) - 1) < 0.12
+    assert abs(halves(found) / halves(flat) - 1) < 0.15
     # contrast of the pebbles themselves, on the logarithm
     fine = [np.log(x[..., 1]) - cv2.GaussianBlur(np.log(x[..., 1]), (0, 0), 12) for x in (flat, found)]
     assert abs(fine[1].std() / fine[0].std() - 1) < 0.05
