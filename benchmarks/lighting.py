@@ -257,7 +257,8 @@ def _judged(case: Case, pixels: np.ndarray, kept: np.ndarray, truth: list) -> di
     """How far pixels (H, W, 3) linear are from the truth over what is kept (H, W) bool.
 
     halves: CIEDE2000 between the mean colour as found on the brighter and on the darker half; contrast: of the detail,
-    found over true; error: CIEDE2000 per pixel, exposures matched; swd: of the patches to those of the whole truth, x 1000, exposures matched. truth: those patches.
+    found over true; error: CIEDE2000 per pixel, exposures matched; swd: of the patches to those of the whole truth,
+    x 1000, exposures matched. truth: those patches.
     """
     own = kept & ~case.foreign
     gain = np.log(np.maximum(pixels, 1e-4) / np.maximum(case.truth, 1e-4))

@@ -27,6 +27,7 @@ AXIS = np.array([0.0, 0.0, 1.0])
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
 ENOUGH_LINES = 100
 LEAST_CONFIDENCE = 0.5
+SUSPECTED = 0.05  # confidence from which on a slant that was not told for certain is worth a warning
 SHARE = 0.5  # of the exemplar's texel density, below which a part is seen too obliquely
 MOST_SAMPLES = 4  # per texel and axis
 DARKEST = 1e-3
@@ -112,14 +113,16 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     """Rectify a region of a photo by the plane that is found, if it is.
 
     pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel; view as `look` finds it. A region that is
-    seen from the front, or of which nothing certain is found, is returned as it is.
+    seen from the front, or of which nothing certain is found, is returned as it is, with a warning where much speaks
+    for a slant.
     """
     estimate = find_plane(pixels, mask, view)
     if estimate is not None and estimate.slant < LEAST_SLANT:
         return Rectification(pixels, mask, normal=-estimate.normal, confidence=estimate.confidence)
     if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
+        confidence = estimate.confidence if estimate else 0.0
         warning = "the slant of the region could not be told for certain; it is used as the photo shows it"
-        return Rectification(pixels, mask, confidence=estimate.confidence if estimate else 0.0, warnings=[warning])
+        return Rectification(pixels, mask, confidence=confidence, warnings=[warning] if confidence >= SUSPECTED else [])
     where = np.array(_centroid(mask))
     to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
     turn = _turn(view.segments.within(mask), to_photo)

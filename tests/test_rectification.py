@@ -65,7 +65,16 @@ def test_a_region_seen_from_the_front_stays_bit_for_bit():
 def test_noise_on_a_plain_wall_is_no_plane():
     pixels = 0.5 + 0.002 * np.random.default_rng(0).standard_normal((384, 384, 3)).astype(np.float32)
     found = rectification.rectify(pixels, np.ones((384, 384), bool), view_of(pixels))
-    assert found.method == "off"
+    assert found.method == "off" and not found.warnings
+
+
+def test_a_slant_is_warned_of_only_where_much_speaks_for_it(monkeypatch):
+    pixels, mask = pebbles(384, 384), np.ones((384, 384), bool)
+    for confidence, said in ((0.3, True), (0.01, False)):
+        estimate = rectification.PlaneEstimate(tilted(40, 0.3), confidence, {})
+        monkeypatch.setattr(rectification, "find_plane", lambda *arguments, found=estimate: found)
+        rectified = rectification.rectify(pixels, mask, view_of(pixels))
+        assert rectified.method == "off" and bool(rectified.warnings) == said
 
 
 def corners_in_photo(normal, rectangle, side=384):
