@@ -303,13 +303,16 @@ def _draw_quality(column, settings, regions):
     column = column.column(align=True)
     column.use_property_split = False
     column.row(align=True).prop(settings, "quality", expand=True)
+    qualities = settings.bl_rna.properties["quality"].enum_items
+    seconds = [history.expected(settings, item.identifier, max(1, regions)) for item in qualities]
+    if not any(seconds):
+        return
     times = column.row(align=True)
     times.active = False
-    for item in settings.bl_rna.properties["quality"].enum_items:
-        seconds = history.expected(settings, item.identifier, max(1, regions))
+    for one in seconds:
         cell = times.row(align=True)
         cell.alignment = "CENTER"
-        cell.label(text=duration(seconds, brief=True) if seconds else "")
+        cell.label(text=duration(one, brief=True) if one else "")
 
 
 def _draw_engine_state(layout, context, settings):
@@ -354,7 +357,8 @@ def _draw_set_up(layout):
 
 
 def _draw_text(layout, context, text, icon):
-    """Labels don't wrap: break `text` at the sidebar's width."""
+    """Labels don't wrap: break `text` at the sidebar's width, as a sentence."""
+    text = text[:1].upper() + text[1:]
     scale = context.preferences.system.ui_scale
     length = max(16, int(context.region.width / (7.5 * scale)) - 6)
     column = layout.column(align=True)

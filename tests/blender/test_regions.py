@@ -173,7 +173,7 @@ def test_the_sidebar_shows_what_there_is(draw, settings, photo_and_masks, make_r
         settings.palette_view = view
         said = draw()
         assert {"Assign", "Assign and Map", "Variation", "tile_size", "Roughness ±", "relief"} <= set(said)
-        assert "Compare" not in said and "over-exposed" in said
+        assert "Compare" not in said and "Over-exposed" in said
     bpy.data.materials.remove(material)
     assert "Remove from Palette" in draw()
 

@@ -38,19 +38,21 @@ press() {
   done
   expect "$2" 1
 }
-# popped COMMAND...: run it and wait until the middle of the screen has changed
+# popped COMMAND...: run it and wait until the screen beside the sidebar has changed
 popped() {
   local before i
-  before=$(middle)
+  before=$(beside)
   "$@"
   for ((i = 0; i < 60 * ${PALETTE_PATIENCE:-1}; i++)); do
     sleep 0.5
-    if [ "$(middle)" != "$before" ]; then sleep 1; return 0; fi
+    if [ "$(beside)" != "$before" ]; then sleep 1; return 0; fi
   done
   echo "nothing popped up after $*" >&2
   return 1
 }
-middle() { xc bash -c 'import -window root -crop 900x700+300+150 rgb:- | md5sum'; }
+beside() {
+  xc bash -c 'for part in 700x700+300+150 250x350+1340+500; do import -window root -crop $part rgb:-; done | md5sum'
+}
 # at X Y: pixel of the screen for a place in the photo, in thousandths of its width and height
 at() { python3 - "$PALETTE_STATE" "$1" "$2" <<'PY'
 import json, sys
