@@ -120,6 +120,12 @@ def larger():
     bpy.ops.ed.undo_push(message="Larger")
 
 
+def search():
+    """As F3 over the Image Editor."""
+    with editor():
+        bpy.ops.wm.search_menu("INVOKE_DEFAULT")
+
+
 def look_at_objects():
     """The large area becomes a 3D View with the tab Palette."""
     area = blender_gui.find_area("IMAGE_EDITOR")

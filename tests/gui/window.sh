@@ -43,7 +43,7 @@ popped() {
   local before i
   before=$(beside)
   "$@"
-  for ((i = 0; i < 60 * ${PALETTE_PATIENCE:-1}; i++)); do
+  for ((i = 0; i < 20 * ${PALETTE_PATIENCE:-1}; i++)); do
     sleep 0.5
     if [ "$(beside)" != "$before" ]; then sleep 1; return 0; fi
   done
