@@ -157,7 +157,7 @@ class BackgroundOperator(NeedsPackages, _Free):
         # stopped by a new file or by disabling the extension
         if _current is None or _current.operator is not self:
             return {"CANCELLED"}
-        if event.type == "ESC" and event.value == "PRESS":
+        if event.type == "ESC" and event.value == "PRESS" and not _over_file_browser(context, event):
             cancel()
             _current.shown = 0.0
             _show(context)
@@ -231,6 +231,16 @@ class BackgroundOperator(NeedsPackages, _Free):
         finally:
             self.discard(value)
         return {"FINISHED"}
+
+
+def _over_file_browser(context, event):
+    """Whether the key is meant for a file browser, which Esc closes."""
+    return any(
+        area.type == "FILE_BROWSER"
+        and 0 <= event.mouse_x - area.x < area.width
+        and 0 <= event.mouse_y - area.y < area.height
+        for area in context.window.screen.areas
+    )
 
 
 def _scene(run):
