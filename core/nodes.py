@@ -411,6 +411,20 @@ def _build_tree(material, record, folder, pack, images, shared):
             _set_constant(principled, role, map_["value"], record["name"])
     if textures:
         _wire_textures(tree, principled, textures, record["metres_per_tile"])
+    image = textures.get("basecolor")
+    # what the 3D View shows of it in Solid shading
+    material.diffuse_color = _mean(image) if image else principled.inputs["Base Color"].default_value
+
+
+def _mean(image):
+    """Mean colour of a base colour's image, linear RGBA."""
+    from .image import linear_from_srgb  # needs packages that may be missing
+
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels = pixels.reshape(-1, 4)[:, :3]
+    # Blender has decoded those of more than 8 bits itself
+    return (*(pixels if image.is_float else linear_from_srgb(pixels)).mean(0), 1.0)
 
 
 def _set_constant(principled, role, value, name):

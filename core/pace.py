@@ -30,7 +30,7 @@ def expected(history: list[dict], engine: str, quality: str, resolution: int, ma
 
 def _cost(quality, resolution):
     """Beside that of `balanced` at 1024 px: a part that each region takes, and one that grows with the side to 1.6."""
-    return _QUALITY.get(quality, 1.0) * (0.08 + 0.92 * (resolution / 1024) ** 1.6)
+    return 0.12 + 0.88 * _QUALITY.get(quality, 1.0) * (resolution / 1024) ** 1.6
 
 
 def remembered(path: Path | None) -> list[dict]:

@@ -88,6 +88,18 @@ def test_colour_spaces(tmp_path, make_record, write_maps):
     }
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+def test_solid_shading_shows_the_mean_colour(tmp_path, make_record, bits):
+    from material_palette.core.image import srgb_from_linear, write_image
+
+    colours = np.array([[[0.5, 0.1, 0.02]], [[0.1, 0.3, 0.06]]], np.float32)
+    write_image(tmp_path / "stone.png", srgb_from_linear(np.tile(colours, (8, 16, 1))), bits=bits)
+    material = nodes.build_material(make_record({"basecolor": {"file": "stone.png"}}), tmp_path, pack=True)
+    assert tuple(material.diffuse_color) == pytest.approx((0.3, 0.2, 0.04, 1.0), abs=0.003)
+    constant = nodes.build_material(make_record(), tmp_path, pack=True)
+    assert tuple(constant.diffuse_color) == pytest.approx((0.2, 0.3, 0.4, 1.0))
+
+
 def test_height_rides_along_without_a_node(tmp_path, make_record, write_maps):
     material = nodes.build_material(make_record(write_maps()), tmp_path, pack=True)
     assert material["height"].name == "stone_height"

@@ -13,6 +13,10 @@ tell two_regions
 tell diffusion
 picture diffusion
 tell patch
+press_text Options
+picture options
+press_text Options
+sleep 1
 press "Extract Palette" running 20
 expect "not running and len(palette) == 2 and not error" 200
 picture extracted

@@ -230,7 +230,7 @@ def enter_file():
     space = blender_gui.find_area("FILE_BROWSER").spaces.active
     if space.params is None:  # not drawn yet
         return 0.5
-    space.params.asset_library_reference = "LOCAL"
+    space.params.asset_library_reference, space.show_region_toolbar = "LOCAL", False
     return None
 
 
