@@ -38,6 +38,11 @@ def timed(function, then):
     return run
 
 
+def method(draw):
+    """Blender gives a method as many arguments as it names."""
+    return lambda self, context: draw(self, context)
+
+
 def total(parts):
     return tuple(sum(part[i] for part in parts) for i in (0, 1))
 
@@ -59,9 +64,10 @@ def watch():
     draw = timed(overlay._draw, on_overlay)
     overlay._handle = bpy.types.SpaceImageEditor.draw_handler_add(draw, (), "WINDOW", "POST_PIXEL")
     for section in sidebar._SECTIONS:
-        section.draw = timed(section.draw, panels.append)
+        section.draw = method(timed(section.draw, panels.append))
     operator = sys.modules[NAME + "operators.background"].BackgroundOperator
-    operator.modal = timed(operator.modal, spent["tick"].append)
+    modal = timed(operator.modal, spent["tick"].append)
+    operator.modal = lambda self, context, event: modal(self, context, event)
     for module, name in (("examine", "_look"), ("preview", "_draw")):
         module = sys.modules[NAME + "operators." + module]
         setattr(module, name, timed(getattr(module, name), spent["tick"].append))
