@@ -31,6 +31,7 @@ dev.load_package()
 from material_palette.benchmarks import charts, records, scenes, svbrdf  # noqa: E402
 from material_palette.benchmarks.baselines import largest_square  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
+from material_palette.benchmarks.zero_shot import ZeroShot  # noqa: E402
 from material_palette.core import decomposition, palette, perceptual  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.exemplar import LUMINANCE  # noqa: E402
@@ -364,8 +365,10 @@ def resembling(number: int, tested, every, options) -> list[dict]:
     """The paper's other table, on a scene's photo: distances of maps to those of a random material of their class.
 
     Rows: ours from true masks and from automatic ones; the known material itself (the least that can be asked for);
-    ours against a material of another class (no resemblance at all).
+    ours against a material of another class (no resemblance at all). With CLIP's weights also the place at which it
+    puts the class of a tile of the base colour.
     """
+    classify = ZeroShot(options.clip, sorted({known.kind for known in every})) if options.clip else None
     kind, parts, truth, _, shown = photographed(number, tested, options)
     across = scenes.KINDS[kind]
     view, found = palette.rectification.look(shown.photo), []
@@ -393,6 +396,9 @@ def resembling(number: int, tested, every, options) -> list[dict]:
                 rows["ours, other class"] = other, ours
         for row, (reference, answer) in rows.items():
             facts = {"scene": f"{number}_{kind}", "part": part, "material": known.name, "class": known.kind, "row": row}
+            if classify and "other" not in row:
+                albedo = pictures(answer.maps, 1.0)[0]
+                facts["clip_rank"] = classify.rank(albedo, known.kind)
             found.append(facts | compare(reference, tile, answer, 1000 * number + i))
     return found
 
@@ -450,10 +456,14 @@ def duels(rows: list[dict]) -> dict:
 
 def resemblance_table(rows: list[dict]) -> str:
     """Markdown: medians over the parts."""
-    lines = ["| row | parts | A | N | R |", "|---|---|---|---|---|"]
+    clip = any("clip_rank" in r for r in rows)
+    lines = ["| row | parts | A | N | R |" + " CLIP top-1 | top-5 |" * clip, "|---" * (5 + 2 * clip) + "|"]
     for name in dict.fromkeys(r["row"] for r in rows):
         own = [r for r in rows if r["row"] == name]
         cells = " | ".join(f"{np.median([r[key] for r in own]):.3f}" for key in "ANR")
+        if clip:
+            ranks = np.array([r["clip_rank"] for r in own if "clip_rank" in r])
+            cells += " | " + " | ".join(f"{np.mean(ranks <= n):.3f}" if len(ranks) else "" for n in (1, 5))
         lines.append(f"| {name} | {len(own)} | {cells} |")
     return "\n".join(lines)
 
@@ -495,6 +505,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "dist" / "benchmarks" / "endtoend")
     parser.add_argument("--scenes", type=int, default=6, help="how many (%(default)s use every material once)")
     parser.add_argument("--presets", type=int, default=2, help="scenes with all presets, not `balanced` alone (2)")
+    parser.add_argument("--clip", type=Path, metavar="DIR", help="CLIP's weights, for its classes of what is extracted")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no scene after so long; go on later")
     parser.add_argument("--quick", action="store_true", help="one small scene, one preset")
     options = parser.parse_args(arguments)
