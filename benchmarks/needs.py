@@ -9,7 +9,8 @@ materials of DATA (CC0, test split, in their own size). Each is rendered by Cycl
 fitted to the scene for several errors that may be made; the product's own functions fit, write and build. Three suns
 light it one after the other and together, without bounces, and a pixel is the mean of samples on a grid: pictures have
 no noise, so that what differs is the textures. Seconds and memory are those of a process that opens the file and
-renders it as a user would. Writes needs.csv, needs.json, the chart and the pictures.
+renders it as a user would. Writes needs.csv, needs.json, the chart, and needs.jpg: the full palette's picture, the
+fitted one's, and their FLIP.
 """
 
 import argparse
@@ -39,7 +40,7 @@ from material_palette.core.region import read_regions  # noqa: E402
 SIZE, GRID = (960, 540), 8  # samples along a pixel's side
 BORDER = (0.4375, 0.5625, 0.35, 0.5)  # what is rendered: from left to right and from below, whole pixels
 SUNS = (((0.6, 0.2, 0.4), 2.5), ((0.9, 0.0, -0.9), 1.2), ((0.3, -0.9, 0.0), 0.8))  # rotation, strength
-VISIBLE = (0.02, 0.03)
+VISIBLE = (0.016, reduction.VISIBLE, 0.034)
 EXAMPLE = ROOT / "examples" / "viaduct"
 SHIPPED = f"fitted, {reduction.VISIBLE:g}"
 COST_SAMPLES = 16
@@ -202,7 +203,11 @@ def measure(kind: str, number: int, name: str, materials, options, work: Path) -
         pictures = [encoded(picture, gain) for picture, gain in zip(pictures, gains, strict=True)]
         reference = reference or pictures
         differences = [flip(a, b) for a, b in zip(reference, pictures, strict=True)]
-        cv2.imwrite(str(work / f"{version}.png"), np.rint(pictures[-1][..., ::-1] * 255).astype(np.uint8))
+        if version == SHIPPED:
+            # FLIP 0.2 is white
+            difference = np.repeat(5 * differences[-1][..., None], 3, -1).clip(0, 1)
+            strip = np.concatenate([reference[-1], pictures[-1], difference], 1)
+            cv2.imwrite(str(work / "pictures.png"), np.rint(strip[..., ::-1] * 255).astype(np.uint8))
         row = {
             "scene": kind,
             "palette": name,
@@ -319,6 +324,10 @@ def main(arguments: list[str] | None = None) -> int:
             summary[version]["render_peak_mb_less"] = float(np.median(less))
         print(version, {k: round(v, 4) for k, v in summary[version].items()})
     records.write(options.output, "needs", rows, {"summary": summary, "grid": options.grid}, parts)
+    strips = [cv2.imread(str(path)) for path in sorted(work.glob("*/pictures.png"))]
+    across = 2 - len(strips) % 2
+    sheet = np.concatenate([np.concatenate(strips[i : i + across], 1) for i in range(0, len(strips), across)])
+    cv2.imwrite(str(options.output / "needs.jpg"), sheet, [cv2.IMWRITE_JPEG_QUALITY, 90])
     chart(rows, options.output / "needs")
     return 0
 

@@ -168,7 +168,7 @@ def test_a_kept_concept_gives_the_same_texture_again_and_others(inputs):
     for name in "ab":
         file = f"{name}/{name}_basecolor.png"
         assert (inputs / "again" / file).read_bytes() == (inputs / "out" / file).read_bytes()
-    large = ["--resolution", "256", "--scale", "2", "--overwrite", "-o", str(inputs / "again")]
+    large = ["--resolution", "256", "--scale", "2", "--full-maps", "--overwrite", "-o", str(inputs / "again")]
     assert main(["resample", concepts[0], *large]) == 0
     (material,) = json.loads((inputs / "again/palette.json").read_text())["materials"]
     assert material["metres_per_tile"] == pytest.approx(128 / 96)
