@@ -2,13 +2,14 @@
 """Regions against true masks: `auto` and `pick` beside their opponents, on the same photos in one run.
 
     python benchmarks/segmentation.py --data DATA -o benchmarks/results/segmentation/     about 40 minutes on one core
-    python benchmarks/segmentation.py --data DATA -o DIR --only photos auto   some of: photos auto stability pick time
+    python benchmarks/segmentation.py --data DATA -o DIR --only photos auto     of: photos auto stability pick text time
     python benchmarks/segmentation.py --data DATA -o DIR --quick
 
 DATA is a folder with INDEX.csv, pbr/, textures/, scenes/ and photos/. Collages are made of textures of the test split,
 which nothing was fitted on; no scene and none of its materials was either. Of real photos, patches are labelled by hand
 (photos.json; the later ones when features and merging were chosen): what is measured is which patches are together,
-not where borders lie. Writes segmentation.csv, a row per measure, photo and method, as it goes (a second call goes on
+not where borders lie. Text is sought in every photo and texture, where hardly any is, and in signs drawn into the
+photos. Writes segmentation.csv, a row per measure, photo and method, as it goes (a second call goes on
 where the first ended), segmentation.json, charts and sheet.jpg.
 """
 
@@ -37,14 +38,16 @@ from material_palette.benchmarks.collage import collage, photos, scenes, sources
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
 from material_palette.core.segmentation import segment  # noqa: E402
-from material_palette.core.segmentation.features import describe  # noqa: E402
+from material_palette.core.segmentation.features import DESCRIBED_PIXELS, describe  # noqa: E402
 from material_palette.core.segmentation.pick import Click, select  # noqa: E402
+from material_palette.core.segmentation.text import text_mask  # noqa: E402
 
 COLLAGES = 12
 BOUND = 6  # the user's upper bound, as by default
 SHOWN = ("kodak_", "azure_")  # photos that may be shown
 KINDS = {"scene": "scenes", "collage": "collages", "photo": "real photos", "later": "real photos, later"}
-PARTS = ("photos", "auto", "stability", "pick", "time", "sheet")
+PARTS = ("photos", "auto", "stability", "pick", "text", "time", "sheet")
+SIGNS = ("Museum of Modern Art", "BAKERY & CAFE", "No parking here", "Hotel Europa 1928", "Joiner and Glazier")
 
 
 def ours(pixels: np.ndarray, count: int) -> np.ndarray:
@@ -69,8 +72,9 @@ def changed(pixels: np.ndarray, truth: np.ndarray):
     noise = np.random.default_rng(0).normal(0, 0.03, encoded.shape)
     yield "noise 3 %", linear_from_srgb(np.clip(encoded / 255 + noise, 0, 1)), truth
     yield "blur 1.5 px", cv2.GaussianBlur(pixels, (0, 0), 1.5), truth
-    for stops in (-2, 2):
-        exposed = np.clip(pixels * np.float32(2.0**stops), 0, 1)
+    for stops in (-2, 2):  # with what 8 bits leave of it
+        levels = 255 * srgb_from_linear(np.clip(pixels * np.float32(2.0**stops), 0, 1))
+        exposed = linear_from_srgb(np.round(levels) / np.float32(255))
         yield f"{stops:+} EV", exposed, truth
     yield "+2 EV, where not white", exposed, without(truth, (exposed >= 1).all(-1))
     for scale in (0.5, 2):
@@ -193,6 +197,51 @@ def clicks(table: Table, photos: list, most: int = 3) -> None:
             table.add("pick", photo.name, name, **values)
 
 
+def lettering(table: Table, data: Path) -> None:
+    """The share of each photo and texture that is taken for text, and of a sign's lines that are found in it."""
+    for path in sorted([*(data / "photos").glob("*.jpg"), *(data / "textures").glob("*.jpg")]):
+        name = f"{path.parent.name}_{path.stem}"
+        if ("text", name, "ours") in table.done:
+            continue
+        pixels = np.clip(read_photo(path).pixels, 0, 1)
+        scale = min(1.0, (DESCRIBED_PIXELS / pixels[..., 0].size) ** 0.5)
+        encoded = srgb_from_linear(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        found = {"taken_for_text": lettered(encoded).mean()}
+        if path.parent.name == "photos":
+            signed, lines = sign(encoded, np.random.default_rng(list(path.stem.encode())))
+            found["of_sign"] = lettered(signed)[lines].mean()
+        table.add("text", name, "ours", **found)
+
+
+def lettered(encoded: np.ndarray) -> np.ndarray:
+    return text_mask(cv2.cvtColor(np.clip(encoded, 0, 1).astype(np.float32), cv2.COLOR_RGB2LAB)[..., 0])
+
+
+def sign(encoded: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A photo (h, w, 3) sRGB with a board of two lines, and (h, w) bool where these are; letters of 12 to 40 px."""
+    height, width = encoded.shape[:2]
+    words, font = random.choice(SIGNS, 2), random.choice([cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX])
+    size, stroke = random.uniform(12, 40), 2
+    (across, tall), _ = cv2.getTextSize(max(words, key=len), int(font), 1.0, stroke)
+    size = min(size / tall, 0.8 * width / across)
+    tall, across = int(size * tall), int(1.1 * size * across)
+    left, top = random.integers(0, max(1, width - across - 2 * tall)), random.integers(0, height - 6 * tall)
+    ground, ink = (0.85, 0.15) if random.random() < 0.5 else (0.2, 0.9)
+    board, lines = np.full((height, width), -1.0, np.float32), np.zeros((height, width), np.float32)
+    cv2.rectangle(board, (int(left), int(top)), (int(left) + across + 2 * tall, int(top) + 6 * tall), ground, -1)
+    for line, word in enumerate(words):
+        at = int(left) + tall, int(top) + 2 * tall + int(2.4 * tall * line)
+        (long, _), _ = cv2.getTextSize(word, int(font), size, stroke)
+        cv2.putText(board, word, at, int(font), size, ink, max(1, round(tall / 10)), cv2.LINE_AA)
+        cv2.rectangle(lines, (at[0], at[1] - tall), (at[0] + long, at[1]), 1.0, -1)
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), random.normal(0, 4), 1)
+    board = cv2.warpAffine(board, turn, (width, height), borderValue=-1)
+    lines = cv2.warpAffine(lines, turn, (width, height)) > 0.5
+    shade = 0.9 + 0.1 * encoded.mean(2) / encoded.mean()
+    drawn = np.where(board[..., None] >= 0, (board * shade)[..., None], encoded)
+    return drawn + random.normal(0, 0.01, drawn.shape), lines
+
+
 def times(table: Table, data: Path) -> None:
     """Of a real photo enlarged to 2 megapixels, each in a process of its own."""
     for part in ("auto", "pick"):
@@ -291,6 +340,8 @@ def main(given: list[str] | None = None) -> int:
     for part, run in (("auto", whole_photos), ("stability", stability), ("pick", clicks)):
         if part in arguments.only:
             run(table, known if part == "auto" else known[: len(known) // 2])
+    if "text" in arguments.only:
+        lettering(table, arguments.data)
     if "time" in arguments.only:
         times(table, arguments.data)
     if "sheet" in arguments.only:

@@ -167,6 +167,27 @@ def check_region(region: Region) -> None:
         )
 
 
+def holds_texture(mask: np.ndarray) -> bool:
+    """Whether `check_region` takes a mask (H, W) bool."""
+    try:
+        check_region(Region("region", mask))
+    except PaletteError:
+        return False
+    return True
+
+
+def too_small(count: int, share: float) -> str:
+    """The warning that so many regions, together `share` (0 to 1) of the photo, were left out for their size."""
+    if count == 1:
+        return (
+            f"A part of the photo, {share:.1%} of it, is too small for a region and is left out. Paint it to have it."
+        )
+    return (
+        f"{count} parts of the photo, {share:.1%} of it together, are too small for a region and are left out. "
+        f"Paint them to have them."
+    )
+
+
 def _readable(stem: str) -> str:
     """A file's stem as text that JSON can hold: Linux allows names that are not UTF-8, macOS takes accents apart."""
     return unicodedata.normalize("NFC", stem.encode("utf-8", "replace").decode("utf-8"))

@@ -56,7 +56,7 @@ class MATERIAL_PALETTE_OT_segment(BackgroundOperator, Operator):
         if added:
             settings.active_region = first
         said = [f"{added} regions found" + (f", {len(found) - added} are yours already" if added < len(found) else "")]
-        self.report({"WARNING"} if warnings else {"INFO"}, ". ".join([*said, *warnings]))
+        self.report({"WARNING"} if warnings else {"INFO"}, ". ".join([*said, *(text.rstrip(".") for text in warnings)]))
 
 
 def _taken(settings, shape):

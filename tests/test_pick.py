@@ -111,3 +111,8 @@ def test_the_same_photo_gives_the_same_features_at_any_exposure_beyond_white(sce
     assert (again.vectors == scene[2].vectors).all()
     _, planks, _ = scene
     assert iou(select(bright, [Click(100, 80)]), planks) > 0.9
+
+
+def test_a_dark_photo_has_the_features_of_the_same_photo_longer_exposed(scene):
+    dark, darker = describe(scene[0] / np.float32(4)), describe(scene[0] / np.float32(16))
+    assert (darker.labels == dark.labels).all() and (darker.vectors == dark.vectors).all()

@@ -1,5 +1,6 @@
 """Automatic regions follow materials: by colour or by texture alone, not by light, and wherever their parts lie."""
 
+import re
 import time
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core.errors import Cancelled, PaletteError
-from material_palette.core.image import read_mask, read_photo
+from material_palette.core.image import linear_from_srgb, read_mask, read_photo, srgb_from_linear
 from material_palette.core.region import check_region
 from material_palette.core.segmentation import segment
 
@@ -126,6 +127,17 @@ def test_what_is_no_surface_is_said_and_takes_none_of_the_number(scene, other, w
         assert best_iou(regions, np.pad(mask, ((140, 0), (0, 0)))) > 0.85, name
 
 
+def test_how_many_materials_are_too_small_is_said(scene):
+    pixels = scene[0].copy()
+    for left, colour in ((60, (0.8, 0.05, 0.05)), (240, (0.05, 0.6, 0.1)), (400, (0.9, 0.8, 0.1))):
+        pixels[30:60, left : left + 30] = coloured(noise(3)[:30, :30], colour)
+    words = []
+    segment(pixels, regions=6, warn=words.append)
+    (text,) = words
+    count, share = re.match(r"(\d) parts of the photo, ([\d.]+)% of it together, are too small", text).groups()
+    assert int(count) >= 3 and float(share) == pytest.approx(100 * 3 * 900 / 360 / 480, rel=0.4)
+
+
 def test_a_photo_of_sky_or_of_blur_alone_is_a_region_all_the_same(scene):
     for pixels in (sky()[:, :120], soft(), cv2.GaussianBlur(scene[0], (0, 0), 4)):
         words = []
@@ -149,8 +161,11 @@ def test_regions_are_few_disjoint_ordered_and_large_enough(scene, count):
 def test_segmentation_is_the_same_again_and_at_any_exposure(scene):
     first, again, bright = segment(scene[0]), segment(scene[0].copy()), segment(scene[0] * 2.0**12)
     assert all((a.mask == b.mask).all() for a, b in zip(first, again, strict=True))
+    levels = 255 * srgb_from_linear(scene[0] * np.float32(2.0**-4))
+    dark = segment(linear_from_srgb(np.round(levels) / np.float32(255)))  # as a file of 8 bits has it
     for region in first:
         assert best_iou(bright, region.mask) > 0.8
+        assert best_iou(dark, region.mask) > 0.8
 
 
 def test_two_megapixels_take_at_most_four_seconds_and_stop_at_once(scene):

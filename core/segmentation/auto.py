@@ -11,7 +11,8 @@
    islands of one material become one region. It goes on below the user's bound while two are as near as parts of one
    material are: vectors have deviation 1 along each direction within a material, so that limit is one number.
 4. What holds no texture of a surface is left out and said, and takes none of the N: blue sky with its clouds, before 3,
-   so that no wall merges with a cloud; overexposed or out of focus, after it; at last what is too thin.
+   so that no wall merges with a cloud, and lines of text; overexposed or out of focus, after it; at last what is too
+   thin or too small.
 """
 
 import heapq
@@ -20,9 +21,9 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
-from ..errors import PaletteError
-from ..region import Region, check_region
+from ..region import Region, holds_texture, too_small
 from .features import BAND_COLUMNS, Features, describe
+from .text import text_mask
 
 BAND_SCALES = (1, 2)  # px; more scales blur the textures of neighbours into each other
 WEIGHTS = {"lightness": 1.0, "a": 1.0, "b": 1.0, "band": 0.5, "orientation": 1.5}
@@ -51,42 +52,49 @@ def segment_auto(
 ) -> list[Region]:
     """At most `regions` disjoint regions "region_1".. of a photo (H, W, 3) linear float32, by decreasing area.
 
-    Nothing is drawn at random: `seed` and `weights` are there for other engines. Left out are regions under 1 % of the
-    photo, and, with a word to `warn`, those too thin to hold a texture and those that are no surface.
+    Nothing is drawn at random: `seed` and `weights` are there for other engines. Left out, with a word to `warn`, are
+    regions under 1 % of the photo (one word for all), those too thin to hold a texture and those that are no surface.
     """
     features = describe(pixels, lambda fraction, message: progress(0.6 * fraction, "Segmenting"))
     parts = _connected(
         features, max(TOUCHING_UNTIL, regions), lambda fraction: progress(0.6 + 0.27 * fraction, "Segmenting")
     )
-    owner, left_out = surfaces_of(features, parts, regions)
+    parts, text = _text(features, parts)
+    owner, left_out = surfaces_of(features, parts, text, regions)
     count = owner.max() + 1
     for number, inside in enumerate(left_out.values(), count):
         owner[inside[parts]] = number
+    small = [np.average(owner == material, weights=features.size) for material in np.unique(owner[owner < 0])]
+    owner = np.maximum(owner, -1)
     found = []
     for fraction, region, mask in _masks(owner[features.labels], pixels.shape[:2], progress):
         progress(0.94 + 0.05 * fraction, "Segmenting")
         reason = None
         if region >= count:
             reason = list(left_out)[region - count]
+        elif holds_texture(mask):
+            found.append(mask)
         else:
-            try:
-                check_region(Region("region", mask))
-                found.append(mask)
-            except PaletteError:
-                reason = "is too thin to hold a texture"
-        if reason and mask.mean() >= LEAST_SHARE:
+            reason = "is too thin to hold a texture"
+        if reason and mask.mean() < LEAST_SHARE:
+            small.append(mask.mean())
+        elif reason:
             rows, columns = np.nonzero(mask)
             where = f"around ({np.median(columns):.0f}, {np.median(rows):.0f}) px, {mask.mean():.0%} of the photo,"
             warn(f"A region {where} {reason} and is left out. Paint it to have it.")
+    if small:
+        warn(too_small(len(small), sum(small)))
     found.sort(key=np.count_nonzero, reverse=True)
     progress(1.0, "Segmenting")
     return [Region(f"region_{number}", mask) for number, mask in enumerate(found, 1)]
 
 
-def surfaces_of(features: Features, parts: np.ndarray, regions: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """(n,) region 0.. or -1 of every superpixel, and by reason the (parts,) bool that are left out."""
-    left_out = {"looks like sky": _sky(features, parts)}
-    surfaces = ~left_out["looks like sky"]
+def surfaces_of(
+    features: Features, parts: np.ndarray, text: np.ndarray, regions: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """(n,) as from `merged`, and by reason the (parts,) bool that are left out. text (parts,) bool: what is text."""
+    left_out = {"looks like sky": _sky(features, parts) & ~text, "looks like text": text}
+    surfaces = ~np.any(list(left_out.values()), 0)
     if features.size[surfaces[parts]].sum() < LEAST_SHARE * features.size.sum():
         left_out, surfaces = {}, np.ones_like(surfaces)  # there is nothing else, and the user asked for regions
     while True:
@@ -101,9 +109,10 @@ def surfaces_of(features: Features, parts: np.ndarray, regions: int) -> tuple[np
 
 
 def merged(features: Features, parts: np.ndarray, surfaces: np.ndarray, regions: int) -> np.ndarray:
-    """(n,) region 0.. or -1 of every superpixel: parts merged until at most `regions` hold LEAST_SHARE of the photo.
+    """(n,) region of every superpixel: parts merged until at most `regions` hold LEAST_SHARE of the photo.
 
-    parts (n,) int: of every superpixel; surfaces (parts,) bool: the other parts are in no region.
+    Regions are 0.., materials too small for one below 0, each its own number. parts (n,) int: of every superpixel;
+    surfaces (parts,) bool: the other parts are in no region; they are -1 too.
     """
     owner, count = parts.copy(), len(surfaces)
     share = np.bincount(owner, features.size) / features.size.sum()
@@ -127,8 +136,9 @@ def merged(features: Features, parts: np.ndarray, surfaces: np.ndarray, regions:
         alive[b] = False
         owner[owner == b] = a
     kept = np.full(count, -1)
-    large = np.flatnonzero(alive & (share >= LEAST_SHARE))
-    kept[large] = np.arange(len(large))
+    large, small = alive & (share >= LEAST_SHARE), alive & (share < LEAST_SHARE)
+    kept[large] = np.arange(large.sum())
+    kept[small] = -1 - np.arange(small.sum())
     return kept[owner]
 
 
@@ -238,6 +248,16 @@ def _merged_neighbours(
     while (parent[parent] != parent).any():
         parent = parent[parent]
     return np.unique(parent, return_inverse=True)[1]
+
+
+def _text(features: Features, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) parts of which text is one of its own, and (parts,) bool where it is."""
+    mask = text_mask(features.lab[..., 0])
+    written = np.bincount(features.labels.ravel(), mask.ravel()) > 0.5 * features.size
+    parts = np.unique(np.where(written, parts.max() + 1, parts), return_inverse=True)[1]
+    text = np.zeros(parts.max() + 1, bool)
+    text[parts[written]] = True
+    return parts, text
 
 
 def _sky(features: Features, parts: np.ndarray) -> np.ndarray:

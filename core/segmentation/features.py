@@ -22,6 +22,8 @@ from ..tensors import read_tensors
 
 DISCRIMINANT = Path(__file__).resolve().parent.parent.parent / "models" / "segmentation.safetensors"
 DESCRIBED_PIXELS = 400_000
+BRIGHT = 0.5  # linear; a darker photo is exposed so that its brightest hundredth begins here
+MOST_GAIN = 64.0  # beyond it there is nothing but the camera's noise
 SUPERPIXELS = 1600
 SLIC_RULER = 10.0  # weight of compactness against colour
 SLIC_STEPS = 6
@@ -110,12 +112,13 @@ def _discriminant() -> dict[str, np.ndarray]:
 
 
 def _reduced(pixels: np.ndarray) -> np.ndarray:
-    """(h, w, 3) float32 linear, at most DESCRIBED_PIXELS, exposed so that 1 is white."""
+    """(h, w, 3) float32 linear, at most DESCRIBED_PIXELS, its brightest hundredth from BRIGHT to 1 on."""
     height, width = pixels.shape[:2]
     scale = min(1.0, (DESCRIBED_PIXELS / (height * width)) ** 0.5)
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    return small / max(1.0, float(np.percentile(small, 99)))  # a photo in floats may be exposed beyond 1
+    bright = float(np.percentile(small.max(2), 99))  # a photo in floats may be exposed beyond 1
+    return small * np.float32(min(BRIGHT / bright, MOST_GAIN) if 0 < bright < BRIGHT else 1 / max(1.0, bright))
 
 
 def _superpixels(lab: np.ndarray, progress: Callable[[float], None]) -> np.ndarray:

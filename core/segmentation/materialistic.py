@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import PaletteError
 from ..image import srgb_from_linear
-from ..region import Region, check_region
+from ..region import Region, holds_texture, too_small
 from .pick import Click
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
@@ -90,7 +90,7 @@ def segment_materialistic(
     network = Materialistic(weights)
     network.look(pixels, lambda fraction, message: progress(0.5 * fraction, message))
     uncovered = np.ones(pixels.shape[:2], bool)
-    found = []
+    found, small = [], []
     asked = 0
     while len(found) < regions and asked < 3 * regions and uncovered.mean() >= LEAST_SHARE:
         depth = cv2.distanceTransform(np.pad(uncovered, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -100,12 +100,10 @@ def segment_materialistic(
         uncovered &= ~mask & (around == 0)  # what gave nothing is not asked again
         asked += 1
         progress(0.5 + 0.49 * max(len(found) / regions, asked / (3 * regions)), "Segmenting")
-        try:
-            check_region(Region("region", mask))
-        except PaletteError:
-            continue
-        if mask.mean() >= LEAST_SHARE:
-            found.append(mask)
+        if mask.any():
+            (found if mask.mean() >= LEAST_SHARE and holds_texture(mask) else small).append(mask)
+    if small:
+        warn(too_small(len(small), np.sum(small) / uncovered.size))
     found.sort(key=np.count_nonzero, reverse=True)
     progress(1.0, "Segmenting")
     return [Region(f"region_{number}", mask) for number, mask in enumerate(found, 1)]

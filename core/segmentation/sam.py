@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import PaletteError
 from ..image import srgb_from_linear
-from ..region import Region, check_region
+from ..region import Region, holds_texture, too_small
 from .pick import Click
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the photos all these models were trained on
@@ -247,14 +247,11 @@ def segment_sam(
     progress(0.1, "Looking at the photo")
     sam.look(pixels)
     masks = sam.everything(lambda fraction, message: progress(0.4 + 0.59 * fraction, message))
-    found = []
+    found, small = [], []
     for mask in masks:
-        try:
-            check_region(Region("region", mask))
-        except PaletteError:
-            continue
-        if mask.mean() >= LEAST_SHARE:
-            found.append(mask)
+        (found if mask.mean() >= LEAST_SHARE and holds_texture(mask) else small).append(mask)
+    if small:
+        warn(too_small(len(small), np.sum(small) / pixels[..., 0].size))
     if len(found) > regions:
         warn(f"Segment Anything found {len(found)} regions; the {regions} largest are kept.")
     progress(1.0, "Segmenting")
