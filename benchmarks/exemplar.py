@@ -32,6 +32,7 @@ dev.load_package()
 from material_palette.benchmarks import charts, lighting, measures  # noqa: E402
 from material_palette.benchmarks.records import commit, machine  # noqa: E402
 from material_palette.core import rectification  # noqa: E402
+from material_palette.core.cylinder import Cylinder  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402
 from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
@@ -176,26 +177,30 @@ def judge_slanted(photo: Slanted, texture: Texture, full: bool) -> dict:
     }
     if full:
         plain = rectification.Rectification(photo.pixels, photo.mask)
-        result |= {"swd_before": swd_to_flat(plain, photo, texture), "swd_after": swd_to_flat(found, photo, texture)}
+        result |= {
+            f"swd_{name}": swd_to_flat(one, scale_of(one, photo), texture)
+            for name, one in (("before", plain), ("after", found))
+        }
     return result
 
 
-def swd_to_flat(found: rectification.Rectification, photo: Slanted, texture: Texture, size: int = 256) -> float:
-    """Patch SWD of the texture synthesised from an exemplar to the true flat one, at the exemplar's own scale.
-
-    The scale is that of the true plane in the middle of the exemplar, the geometric mean of both directions.
-    """
-    exemplar = cut_exemplar(found.pixels, found.mask)
-    encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
-    concept = patch.learn(encoded, exemplar.mask, _quiet)
-    made = patch.sample(concept, (size, size), 0, _quiet, "draft").pixels
+def scale_of(found: rectification.Rectification, photo: Slanted) -> float:
+    """Texture px per texel of the true plane in the middle of the exemplar, the geometric mean of both directions."""
     h = found.homography if found.homography is not None else np.eye(3)
     side = photo.mask.shape[0]
     centre = ((side - 1) / 2,) * 2
     to_plane = np.linalg.inv(rectification.plane_to_photo(photo.normal, photo.focal, centre, centre)) @ h
     y, x = (np.median(v) for v in np.nonzero(found.mask))
     bottom = to_plane[2] @ [x, y, 1]
-    scale = np.sqrt(abs(np.linalg.det(to_plane)) / abs(bottom) ** 3) * photo.focal * photo.density  # texture px a texel
+    return np.sqrt(abs(np.linalg.det(to_plane)) / abs(bottom) ** 3) * photo.focal * photo.density
+
+
+def swd_to_flat(found: rectification.Rectification, scale: float, texture: Texture, size: int = 256) -> float:
+    """Patch SWD of the texture synthesised from an exemplar to the true flat one, at `scale` texture px per texel."""
+    exemplar = cut_exemplar(found.pixels, found.mask)
+    encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
+    concept = patch.learn(encoded, exemplar.mask, _quiet)
+    made = patch.sample(concept, (size, size), 0, _quiet, "draft").pixels
     tiled = np.tile(texture.pixels, (2, 2, 1))
     w, h = (max(64, round(n / scale)) for n in tiled.shape[1::-1])
     shrink = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
@@ -204,6 +209,87 @@ def swd_to_flat(found: rectification.Rectification, photo: Slanted, texture: Tex
     flat = flat + (made.mean((0, 1)) - flat.mean((0, 1)))
     whole = np.ones(flat.shape[:2], bool)
     return measures.sliced_wasserstein(measures.patch_quantiles(made), measures.patch_quantiles(flat, whole))
+
+
+# ---------------------------------------------------------------- curved
+
+
+@dataclass
+class Curved:
+    """A photo of a column from afar: pixels (side, side, 3) float32 linear, mask; the truth."""
+
+    pixels: np.ndarray
+    mask: np.ndarray
+    cylinder: Cylinder | None
+    density: float  # texture px per px of the surface
+
+
+def curved(texture: Texture, half_angle: float, random: np.random.Generator, side: int) -> Curved:
+    """A column that fills the photo's width up to this angle from its middle, standing, lying or leaning."""
+    angle, turn = random.uniform(0, np.pi), random.uniform(0, 2 * np.pi)
+    density = random.uniform(0.7, 1.3) * min(texture.pixels.shape[:2]) / 640
+    across, centre, fine = np.array([np.cos(angle), np.sin(angle)]), np.full(2, (side - 1) / 2), 3
+    half = side / 2 * 0.9
+    cylinder = Cylinder(across, float(centre @ across), half / np.sin(np.radians(half_angle))) if half_angle else None
+    u, v = np.meshgrid(*[(np.arange(side * fine) + 0.5) / fine - 0.5] * 2)
+    points = np.stack([u.ravel(), v.ravel()], -1)
+    mask = (np.abs((points - centre) @ across) <= half).reshape(side, fine, side, fine).all((1, 3))
+    flat = points if cylinder is None else cylinder.unrolled(points)
+    c, s = np.cos(turn), np.sin(turn)
+    at = (flat @ np.array([[c, s], [-s, c]]) * density + random.uniform(0, 1000, 2)).reshape(side * fine, -1, 2)
+    h, w = texture.pixels.shape[:2]
+    wrapped = np.pad(texture.pixels, ((1, 2), (1, 2), (0, 0)), mode="wrap")
+    at = (at % (w, h) + 1).astype(np.float32)
+    photo = cv2.resize(cv2.remap(wrapped, at, None, cv2.INTER_LINEAR), (side, side), interpolation=cv2.INTER_AREA)
+    encoded = srgb_from_linear(photo.clip(0, 1)) + (random.standard_normal(photo.shape) / 255).astype(np.float32)
+    return Curved(linear_from_srgb(np.rint(encoded.clip(0, 1) * 255) / np.float32(255)), mask, cylinder, density)
+
+
+def judge_curved(photo: Curved, texture: Texture, full: bool) -> dict:
+    start = time.process_time()
+    found = rectification.rectify(photo.pixels, photo.mask, rectification.look(photo.pixels))
+    result = {
+        "cpu_seconds": time.process_time() - start,
+        "megapixels": photo.mask.sum() / 1e6,
+        "claimed": float(found.method == "cylinder"),
+        "flattened": float(found.homography is not None),
+        "stretch_before": stretch(rectification.Rectification(photo.pixels, photo.mask), photo),
+        "stretch_after": stretch(found, photo),
+    }
+    if full:
+        plain = rectification.Rectification(photo.pixels, photo.mask)
+        result |= {
+            f"swd_{name}": swd_to_flat(one, photo.density * scale_on(one, photo), texture)
+            for name, one in (("before", plain), ("after", found))
+        }
+    return result
+
+
+def _texels_on_surface(found: rectification.Rectification, photo: Curved) -> np.ndarray:
+    """(n, 2, 2) derivatives of the true surface, laid flat, by the exemplar's px, at some of these."""
+    y, x = np.nonzero(found.mask)
+    at = np.stack([x, y], -1)[:: max(1, len(x) // 2000)].astype(float)
+
+    def surface(points: np.ndarray) -> np.ndarray:
+        if found.cylinder is not None:
+            points = found.cylinder.rolled(points @ found.to_surface[:, :2].T + found.to_surface[:, 2])
+        elif found.homography is not None:
+            points = cv2.perspectiveTransform(points[None], found.homography)[0]
+        return points if photo.cylinder is None else photo.cylinder.unrolled(points)
+
+    return np.stack([surface(at + step) - surface(at - step) for step in ((0.5, 0), (0, 0.5))], -1)
+
+
+def stretch(found: rectification.Rectification, photo: Curved) -> float:
+    """How unlike the exemplar's texels are on the surface: standard deviation of the logarithm of their sides' ratio
+    and of their scale; 0 when all are squares of one size."""
+    long, short = np.maximum(np.linalg.svd(_texels_on_surface(found, photo), compute_uv=False), 1e-3).T
+    return float(np.sqrt((np.log(long / short) ** 2).mean() + np.log(long * short).std() ** 2 / 4))
+
+
+def scale_on(found: rectification.Rectification, photo: Curved) -> float:
+    """Px of the surface per texel, the median of the geometric means of both directions."""
+    return float(np.median(np.sqrt(np.abs(np.linalg.det(_texels_on_surface(found, photo))))))
 
 
 def _quiet(fraction: float, message: str) -> None:
@@ -224,6 +310,13 @@ FAMILIES = {
         lambda texture, severity, random, side: slanted(texture, severity, random, side, known=False),
         judge_slanted,
         SLANT_CURVES[:2],
+    ),
+    "curved": Family(
+        "half-angle seen of a column, degrees",
+        (0.0, 30.0, 45.0, 60.0, 75.0),
+        curved,
+        judge_curved,
+        (("stretch", "stretch of the texels, log"), ("claimed", "share unrolled"), SLANT_CURVES[2]),
     ),
 }
 for _name, (_axis, _severities) in lighting.FAMILIES.items():
@@ -301,7 +394,7 @@ def summarise(rows: list[dict]) -> dict:
         for measure in own[0].keys() - {"family", "severity", "texture", "kind"}:
             values = [float(row[measure]) for row in own if row.get(measure) not in ("", None)]
             if values:
-                share = measure in ("claimed", "false", "shadow", "changed")
+                share = measure in ("claimed", "false", "flattened", "shadow", "changed")
                 entry[measure] = float(f"{(np.mean if share else np.median)(values):.4g}")
         summary.setdefault(family, {}).setdefault(kind, {})[f"{severity:g}"] = dict(sorted(entry.items()))
     return summary

@@ -2,7 +2,8 @@
 
 The plane comes from the user's four corners, from a camera and an object, or is found: of all planes the one under
 which the texture's local spectra agree (`texture_gradient`) and straight lines run in few directions (`vanishing`).
-Where neither says enough, the region stays as it is.
+Where the spectra agree better on a round surface, that is unrolled (`cylinder`). Where nothing says enough, the region
+stays as it is.
 """
 
 from dataclasses import dataclass, field
@@ -10,10 +11,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from .cylinder import Cylinder, find_cylinder, unroll
 from .errors import PaletteError
 from .exemplar import CLIPPED, LARGEST, LUMINANCE
 from .image import srgb_from_linear
-from .texture_gradient import gradient_scores, local_spectra, plane_axes
+from .texture_gradient import Spectra, gradient_scores, local_spectra, plane_axes
 from .vanishing import Segments, find_focal, find_frame, find_segments, line_score
 
 MODES = ("off", "auto", "quad")
@@ -47,9 +49,10 @@ class Rectification:
     """A region ready to be cut.
 
     pixels (h, w, 3) float32 linear and mask (h, w) bool; homography (3, 3): from its px to the photo's px, None where
-    the region was left as it is; method: "off", "corners", "auto" or "plane"; normal (3,): unit, towards the camera,
-    camera coordinates (x right, y down, z forward), None when not known; slant in degrees between it and the optical
-    axis; confidence 0 to 1.
+    the region was left as it is or unrolled: then cylinder is in photo px, and to_surface (2, 3) goes from its px to
+    the surface laid flat; method: "off", "corners", "auto", "plane" or "cylinder"; normal (3,): unit, towards the
+    camera, camera coordinates (x right, y down, z forward), None when not known; slant in degrees between it and the
+    optical axis; confidence 0 to 1.
     """
 
     pixels: np.ndarray
@@ -59,6 +62,8 @@ class Rectification:
     normal: np.ndarray | None = None
     confidence: float = 0.0
     warnings: list[str] = field(default_factory=list)
+    cylinder: Cylinder | None = None
+    to_surface: np.ndarray | None = None
 
     @property
     def slant(self) -> float | None:
@@ -71,16 +76,24 @@ class Rectification:
             record |= {"slant_degrees": round(self.slant, 2), "normal": [round(float(n), 5) for n in self.normal]}
         if self.homography is not None:
             record["homography"] = [[float(f"{v:.9g}") for v in row] for row in self.homography]
+        if self.cylinder is not None:
+            across, middle, radius = self.cylinder.across, self.cylinder.middle, self.cylinder.radius
+            record["cylinder"] = {
+                "across": [round(float(v), 5) for v in across],
+                "middle_px": round(float(middle), 2),
+                "radius_px": round(float(radius), 2),
+            }
         return record
 
 
 @dataclass
 class PlaneEstimate:
-    """normal (3,): unit, away from the camera; confidence 0 to 1; evidence as `_confidence` takes it."""
+    """normal (3,): unit, away from the camera; confidence 0 to 1; evidence as `_confidence` takes it; the spectra."""
 
     normal: np.ndarray
     confidence: float
     evidence: dict[str, float]
+    spectra: Spectra | None = None
 
     @property
     def slant(self) -> float:
@@ -117,6 +130,10 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     for a slant.
     """
     estimate = find_plane(pixels, mask, view)
+    bent = _find_cylinder(estimate, view, mask.shape) if estimate is not None else None
+    if bent is not None:
+        flat, within, to_surface = unroll(pixels, mask, bent, SHARE, LARGEST)
+        return Rectification(flat, within, method="cylinder", cylinder=bent, to_surface=to_surface)
     if estimate is not None and estimate.slant < LEAST_SLANT:
         return Rectification(pixels, mask, normal=-estimate.normal, confidence=estimate.confidence)
     if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
@@ -127,6 +144,19 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
     turn = _turn(view.segments.within(mask), to_photo)
     return resample(pixels, mask, to_photo @ turn, "auto", -estimate.normal, estimate.confidence)
+
+
+def _find_cylinder(estimate: PlaneEstimate, view: View, shape: tuple[int, int]) -> Cylinder | None:
+    """The cylinder, in photo px, that the texture of a region is on rather than on its best plane; None for a plane."""
+    claimed = estimate.slant >= LEAST_SLANT and estimate.confidence >= LEAST_CONFIDENCE
+    if estimate.spectra is None or claimed:
+        return None
+    planes = np.max([gradient_scores(estimate.spectra, n) for n in (AXIS, estimate.normal)], 0)
+    found, _ = find_cylinder(estimate.spectra, planes)
+    if found is None:
+        return None
+    middle = _principal_point(shape) @ found.across + found.middle * view.focal
+    return Cylinder(found.across, float(middle), found.radius * view.focal)
 
 
 # ---------------------------------------------------------------- the plane
@@ -273,7 +303,7 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
         "windows": len(spectra.at),
         "lines": len(segments.ends),
     }
-    return PlaneEstimate(planes[best], _confidence(evidence), evidence)
+    return PlaneEstimate(planes[best], _confidence(evidence), evidence, spectra)
 
 
 def _confidence(evidence: dict[str, float]) -> float:
@@ -367,6 +397,8 @@ def metres_per_texel(points: np.ndarray, metres: float, rectification: Rectifica
     points = np.asarray(points, np.float64)
     if rectification.homography is not None:
         points = _mapped(np.linalg.inv(rectification.homography), points)
+    elif rectification.cylinder is not None:
+        points = rectification.cylinder.unrolled(points) / rectification.to_surface[0, 0]
     length = float(np.linalg.norm(points[1] - points[0]))
     if not (0 < metres < np.inf) or not 0.5 < length < np.inf:
         raise PaletteError("a measure is two different points of the surface and a positive length in metres")

@@ -136,7 +136,11 @@ def gradient_scores(spectra: Spectra, normal: np.ndarray) -> np.ndarray | None:
     inverse_depth = spectra.at @ normal[:2] + normal[2]
     if inverse_depth.min() <= NEAREST_HORIZON * abs(inverse_depth.mean()):
         return None
-    a = local_maps(normal, spectra.at)
+    return spectra_scores(spectra, local_maps(normal, spectra.at))
+
+
+def spectra_scores(spectra: Spectra, a: np.ndarray) -> np.ndarray:
+    """(1 + BLOCKS,) the score of a surface given by its local maps (n, 2, 2), then with each block left out."""
     density = np.log(np.abs(np.linalg.det(a)))
     k = np.einsum("nmi,nai->nma", spectra.frequency, a) * np.exp(-density.mean() / 2)
     power = spectra.power - (density - density.mean())[:, None]
