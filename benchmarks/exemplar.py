@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """From a region in the wild to a flat, evenly lit exemplar: error against the severity of each disturbance.
 
-    python benchmarks/exemplar.py --data DATA -o benchmarks/results/exemplar/             about an hour on two cores
-    python benchmarks/exemplar.py --data DATA --quick -o dist/benchmarks/                 5 minutes
+    python benchmarks/exemplar.py --data DATA -o benchmarks/results/exemplar/             about two hours on a core
+    python benchmarks/exemplar.py --data DATA --quick -o dist/benchmarks/                 12 minutes
 
 DATA holds INDEX.csv and pbr/<set>/<material>/basecolor.jpg. Of its materials only the test split takes part: all of
 polyhaven and every fourth of the other sets. A family of disturbances makes photos of a known texture at growing
@@ -30,7 +30,7 @@ import dev  # noqa: E402
 
 dev.load_package()
 from material_palette.benchmarks import charts, lighting, measures  # noqa: E402
-from material_palette.benchmarks.records import commit, machine  # noqa: E402
+from material_palette.benchmarks.records import command, commit, machine  # noqa: E402
 from material_palette.core import rectification  # noqa: E402
 from material_palette.core.cylinder import Cylinder  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
@@ -376,10 +376,12 @@ def run(
         judged = {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in judged.items()}
         rows.append({"family": name, "severity": severity, "texture": texture.name, "kind": texture.kind} | judged)
         columns = list(dict.fromkeys(key for row in rows for key in row))
-        with open(path, "w", newline="", encoding="utf-8") as file:
+        whole = path.with_suffix(".new")
+        with open(whole, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, lineterminator="\n", restval="")
             writer.writeheader()
             writer.writerows(rows)
+        whole.replace(path)
         print(name, severity, texture.name, judged, flush=True)
     return rows
 
@@ -450,23 +452,25 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     start = time.time()
     path = options.output / "exemplar.csv"
+    done = path.exists()
     rows = run(textures, options.families, every, side, slow, path, 60 * options.minutes)
     summary = summarise(rows)
-    command = ["DATA" if a == str(options.data) else a for a in arguments or sys.argv[1:]]
+    facts_path = options.output / "exemplar.json"
+    before = json.loads(facts_path.read_text(encoding="utf-8")) if facts_path.exists() and done else {}
     facts = {
-        "command": " ".join(["benchmarks/exemplar.py", *command]),
-        "commit": commit(),
+        "commands": sorted({*before.get("commands", []), command()}),
+        "commits": sorted({*before.get("commits", []), commit()}),
         "machine": machine(),
-        "minutes": round((time.time() - start) / 60, 1),
+        "minutes": round(before.get("minutes", 0) + (time.time() - start) / 60, 1),
         "side": side,
         "false_share": {
             name: float(f"{np.mean(shares):.4g}")
-            for name in options.families
+            for name in summary
             if (shares := [float(r["false"]) for r in rows if r["family"] == name and r.get("false") not in (None, "")])
         },
         "summary": summary,
     }
-    (options.output / "exemplar.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    facts_path.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     write_chart(summary, options.output)
     print(json.dumps(facts["false_share"]))
     return 0

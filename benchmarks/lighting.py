@@ -137,6 +137,14 @@ def case(surface: Surface, family: str, severity: float, seed: int, other: Surfa
         photo /= severity
     if family == "clipping" and severity:
         photo *= _pool(random, photo, severity)[..., None]
+    if family == "sheen":
+        # a broad reflection adds white light; nothing clips
+        centre, (v, u) = random.uniform(-0.4, 0.4, 2), np.mgrid[-1 : 1 : SIDE * 1j, -1 : 1 : SIDE * 1j]
+        gloss = severity * np.exp(-((u - centre[0]) ** 2 + (v - centre[1]) ** 2) / 0.3).astype(np.float32)
+        mean = float((photo @ LUMINANCE).mean())
+        exposure /= 1 + severity / 2
+        photo, truth = ((x / (1 + severity / 2)) for x in (photo + mean * gloss[..., None], truth))
+        scale = 1 + gloss
     if family == "foreign" and severity:
         foreign = _strip(random, mask, severity)
         stranger = other.albedo * (flat_sky + flat_sun)
@@ -155,6 +163,7 @@ FAMILIES: dict[str, tuple[str, tuple[float, ...]]] = {
     "striped shadow": ("lit to shaded", (2, 3, 5)),
     "leaf shadow": ("lit to shaded", (2, 3, 5)),
     "clipping": ("share over-exposed", (0, 0.1, 0.2, 0.4)),
+    "sheen": ("reflection over mean brightness", (0.25, 0.5, 1)),
     "foreign": ("share of another material", (0, 0.05, 0.1, 0.2, 0.4)),
     "two tones": ("chequers, bricks, planks, stains, dado, stripes", (0, 1, 2, 3, 4, 5)),
 }
