@@ -25,9 +25,9 @@ void main() {
   vec2 pixel = 1.0 / (high - low);
   float inside = step(0.001, texture(mask, uv).r);
   float least = inside, most = inside;
-  for (int i = 0; i < 8; i++) {
-    float angle = 0.7854 * float(i);
-    float there = step(0.001, texture(mask, uv + width * pixel * vec2(cos(angle), sin(angle))).r);
+  for (int i = 0; i < 4; i++) {
+    vec2 corner = vec2(i & 1, i >> 1) * 2.0 - 1.0;
+    float there = step(0.001, texture(mask, uv + 0.85 * width * pixel * corner).r);
     least = min(least, there);
     most = max(most, there);
   }

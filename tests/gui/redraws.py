@@ -121,6 +121,9 @@ def story():
         "turns": (yield from measured(SECONDS, False)),
         "ours": ours(),
     }
+    bpy.context.scene.material_palette.show_regions = False
+    result["idle, regions hidden"] = {"redraws": (yield from measured(SECONDS, True)), "ours": ours()}
+    bpy.context.scene.material_palette.show_regions = True
     with bpy.context.temp_override(window=blender_gui.window(), area=area(), region=region):
         settings = bpy.context.scene.material_palette
         settings.quality, settings.resolution = "best", 1024
