@@ -94,7 +94,7 @@ def examine(settings, region):
         check_region(Region(region.name, mask))
         box = _square(_middle(mask)[0], _LOOKED_AT)
         if cut_exemplar(linear_from_srgb(pixels[box] / np.float32(255)), mask[box]).uniform is not None:
-            examined.warning = "One colour up to the photo's noise: its material will be a constant"
+            examined.warning = "One colour up to the photo's noise in its middle: its material may become a constant"
     except PaletteError as error:
         examined.warning = str(error)
     return examined, thumbnail
