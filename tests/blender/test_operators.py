@@ -296,6 +296,16 @@ def test_an_error_asked_for_reaches_the_pipeline_and_its_outcome_is_told(ready, 
     assert ready.palette[0].warnings == ""
 
 
+def test_the_network_of_the_preferences_finds_the_maps(settings, monkeypatch):
+    from types import SimpleNamespace
+
+    from material_palette.operators import extract, preferences
+
+    assert extract.sampling(settings, 0)["decomposer"] == "unet"
+    monkeypatch.setattr(preferences, "preferences", lambda context: SimpleNamespace(maps_by="/weights/model.ckpt"))
+    assert extract.sampling(settings, 0)["decomposer"] == "resnet101=/weights/model.ckpt"
+
+
 def test_without_a_kept_concept_resample_says_so(ready, instant):
     bpy.ops.material_palette.extract()
     assert not bpy.ops.material_palette.resample.poll()
