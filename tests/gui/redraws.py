@@ -89,8 +89,13 @@ def measured(seconds, draw):
         else:
             times.append(time.monotonic())
         yield
-    gaps = [b - a for a, b in zip(times, times[1:], strict=False)]
-    return {"per_second": round(len(gaps) / (times[-1] - times[0]), 1), "longest_gap": round(max(gaps), 3)}
+    gaps = sorted(b - a for a, b in zip(times, times[1:], strict=False))
+    return {
+        "per_second": round(len(gaps) / (times[-1] - times[0]), 1),
+        "gap_99": round(gaps[int(0.99 * len(gaps))], 4),
+        "gaps_over_50_ms": sum(gap > 0.05 for gap in gaps),
+        "longest_gap": round(gaps[-1], 3),
+    }
 
 
 def ours():
