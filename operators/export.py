@@ -171,7 +171,7 @@ _items = []  # Blender needs the strings of a dynamic enum to live on
 def _libraries(_operator, context):
     libraries = context.preferences.filepaths.asset_libraries
     _items[:] = [(library.name, library.name, library.path) for library in libraries if library.path]
-    return _items or [("", "No asset library", "Add one in Preferences > File Paths")]
+    return _items or [("", "No asset library", "Add one in Blender's preferences")]
 
 
 class MATERIAL_PALETTE_OT_save_library(_ExportsPalette, Operator):
@@ -181,7 +181,9 @@ class MATERIAL_PALETTE_OT_save_library(_ExportsPalette, Operator):
     bl_label = "Save to Asset Library"
     bl_options = {"REGISTER"}
 
-    library: EnumProperty(name="Library", description="One of Preferences > File Paths", items=_libraries)
+    library: EnumProperty(
+        name="Library", description="One of the asset libraries in Blender's preferences", items=_libraries
+    )
     name: StringProperty(name="File", description="Name of the .blend; a number is added when it is taken")
     only_active: BoolProperty(name="Only the Active Material", description="Leave the others of the palette out")
 
@@ -195,12 +197,14 @@ class MATERIAL_PALETTE_OT_save_library(_ExportsPalette, Operator):
         from ..core.region import file_name
 
         library = next((x for x in context.preferences.filepaths.asset_libraries if x.name == self.library), None)
-        folder = Path(bpy.path.abspath(library.path)) if library else None
-        if folder is None or not folder.is_dir():
-            where = (
-                "no asset library; add one in Preferences > File Paths" if library is None else f"no folder {folder}"
-            )
-            self.report({"ERROR"}, f"There is {where}")
+        if library is None:
+            self.report({"ERROR"}, "There is no asset library; add one in Blender's preferences")
+            return {"CANCELLED"}
+        folder = Path(bpy.path.abspath(library.path))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)  # that of a new Blender is named before it is made
+        except OSError as error:
+            self.report({"ERROR"}, f"There is no folder {folder}, and it can't be made: {error.strerror}")
             return {"CANCELLED"}
         name, number = file_name(self.name.strip() or "palette"), 1
         path = folder / f"{name}.blend"

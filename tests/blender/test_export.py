@@ -91,3 +91,15 @@ def test_a_library_is_complete_and_leaves_the_file_as_it_was(stone, library, tmp
 def test_a_missing_library_is_said(stone):
     with pytest.raises((RuntimeError, TypeError)):
         bpy.ops.material_palette.save_library(library="Nowhere")
+
+
+def test_a_library_whose_folder_is_not_there_yet_gets_it(stone, library):
+    library.rmdir()
+    assert bpy.ops.material_palette.save_library(library="Mine", name="wall") == {"FINISHED"}
+    assert (library / "wall.blend").is_file()
+    (library / "wall.blend").unlink()
+    (library / "blender_assets.cats.txt").unlink()
+    library.rmdir()
+    library.touch()
+    with pytest.raises(RuntimeError, match="can't be made"):
+        bpy.ops.material_palette.save_library(library="Mine", name="wall")
