@@ -17,15 +17,24 @@ def expected(history: list[dict], engine: str, quality: str, resolution: int, ma
     quality; the engine patch is forecast even before any run, as on the machine that the benchmark of speed ran on.
     """
     runs = [run for run in history if run["engine"] == engine]
+    known = {q: _seconds(found, q, resolution) for q in _QUALITY if (found := [r for r in runs if r["quality"] == q])}
+    if quality in known:
+        return materials * known[quality]
     if engine != "patch":
-        runs = [run for run in runs if run["quality"] == quality]
-    same = [run for run in runs if run["quality"] == quality] or runs
-    if not same:
-        return materials * _UNTIMED * _cost(quality, resolution) if engine == "patch" else None
-    nearest = min((run["resolution"] for run in same), key=lambda r: abs(r - resolution))
-    latest = [run for run in same if run["resolution"] == nearest][-_COUNTED:]
+        return None
+    seconds = _seconds(runs, quality, resolution) if runs else _UNTIMED * _cost(quality, resolution)
+    order = list(_QUALITY)  # none takes longer than the next
+    least = [known[q] for q in order[: order.index(quality)] if q in known]
+    most = [known[q] for q in order[order.index(quality) :] if q in known]
+    return materials * min([max([seconds, *least]), *most])
+
+
+def _seconds(runs, quality, resolution):
+    """Of one material, from the latest runs at the nearest resolution."""
+    nearest = min((run["resolution"] for run in runs), key=lambda r: abs(r - resolution))
+    latest = [run for run in runs if run["resolution"] == nearest][-_COUNTED:]
     pace = statistics.median(run["seconds"] / _cost(run["quality"], run["resolution"]) for run in latest)
-    return materials * pace * _cost(quality, resolution)
+    return pace * _cost(quality, resolution)
 
 
 def _cost(quality, resolution):

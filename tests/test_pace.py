@@ -32,6 +32,13 @@ def test_another_quality_stands_in_until_there_is_a_run_of_it():
     assert pace.expected([*history, run(99, quality="best")], "patch", "best", 512, 1) == pytest.approx(99)
 
 
+def test_no_quality_is_said_to_take_longer_than_the_next():
+    """Runs of two qualities on a machine that was busy during one of them."""
+    history = [run(3, 128), run(6, 256, quality="balanced")]
+    seconds = [pace.expected(history, "patch", q, 128, 1) for q in ("draft", "balanced", "best")]
+    assert seconds == sorted(seconds)
+
+
 def test_before_any_run_only_the_engine_that_ships_is_forecast():
     draft, balanced, best = (pace.expected([], "patch", q, 1024, 3) for q in ("draft", "balanced", "best"))
     assert 0 < draft < balanced < best
