@@ -7,8 +7,9 @@
 DATA holds INDEX.csv and pbr/<set>/<material>/basecolor.jpg. Of its materials only the test split takes part: all of
 polyhaven and every fourth of the other sets. A family of disturbances makes photos of a known texture at growing
 severity and judges what the product makes of them; see FAMILIES. Writes exemplar.csv (a row per case; a run that was
-stopped goes on from it), exemplar.json (machine, command, summary), exemplar.svg and .png (the chart). Needs
-requirements-benchmarks.txt besides requirements.txt.
+stopped goes on from it), exemplar.json (machine, commands, summary), exemplar.svg and .png (the chart), columns.jpg
+(columns as seen and unrolled); --minutes 0 draws them again. Needs requirements-benchmarks.txt besides
+requirements.txt.
 """
 
 import argparse
@@ -434,6 +435,23 @@ def write_chart(summary: dict, folder: Path) -> None:
     charts.save(figure, folder / "exemplar")
 
 
+def write_columns(textures: list[Texture], folder: Path, half_angle: float = 75.0, side: int = 448) -> None:
+    """columns.jpg: columns as they are seen, and what is learnt from; of textures with CC0 maps."""
+    rows = []
+    for i, texture in enumerate([t for t in textures if t.name.startswith("polyhaven/")][:4]):
+        photo = curved(texture, half_angle, np.random.default_rng([i, 1]), side)
+        found = rectification.rectify(photo.pixels, photo.mask, rectification.look(photo.pixels))
+        exemplar = cut_exemplar(found.pixels, found.mask).picture()
+        seen = np.rint(255 * srgb_from_linear(np.where(photo.mask[..., None], photo.pixels, 0.01))).astype(np.uint8)
+        scale = min(1.0, side / exemplar.shape[0], 1.6 * side / exemplar.shape[1])
+        exemplar = cv2.resize(exemplar, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        down, right = side - exemplar.shape[0], int(1.6 * side) - exemplar.shape[1]
+        exemplar = np.pad(exemplar, ((0, down), (0, right), (0, 0)), constant_values=25)
+        rows.append(np.hstack([seen, np.full((side, 8, 3), 255, np.uint8), exemplar]))
+    sheet = np.vstack([np.hstack(rows[k : k + 2]) for k in range(0, len(rows), 2)])
+    cv2.imwrite(str(folder / "columns.jpg"), sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, metavar="DATA", help="folder with INDEX.csv and pbr/")
@@ -452,14 +470,15 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     start = time.time()
     path = options.output / "exemplar.csv"
-    done = path.exists()
+    done = sum(1 for _ in open(path, encoding="utf-8")) - 1 if path.exists() else 0
     rows = run(textures, options.families, every, side, slow, path, 60 * options.minutes)
     summary = summarise(rows)
     facts_path = options.output / "exemplar.json"
     before = json.loads(facts_path.read_text(encoding="utf-8")) if facts_path.exists() and done else {}
+    new = len(rows) > done  # else only the chart and the picture are drawn again
     facts = {
-        "commands": sorted({*before.get("commands", []), command()}),
-        "commits": sorted({*before.get("commits", []), commit()}),
+        "commands": sorted({*before.get("commands", []), *[command()] * new}),
+        "commits": sorted({*before.get("commits", []), *[commit()] * new}),
         "machine": machine(),
         "minutes": round(before.get("minutes", 0) + (time.time() - start) / 60, 1),
         "side": side,
@@ -472,6 +491,8 @@ def main(arguments: list[str] | None = None) -> int:
     }
     facts_path.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     write_chart(summary, options.output)
+    if "curved" in summary:
+        write_columns(textures, options.output)
     print(json.dumps(facts["false_share"]))
     return 0
 
