@@ -97,6 +97,31 @@ def test_defaults_are_restored_and_nothing_else(settings, regions):
     assert settings.photo is not None and len(regions) == 2
 
 
+def test_defaults_of_the_preferences_are_those_restored(settings, regions, monkeypatch):
+    from types import SimpleNamespace
+
+    from material_palette.operators import preferences
+
+    chosen = SimpleNamespace(quality="draft", resolution=512, author="Me", licence="CC0")
+    monkeypatch.setattr(preferences, "preferences", lambda context: chosen)
+    settings.quality, settings.author = "best", "Another"
+    bpy.ops.material_palette.restore_defaults()
+    assert (settings.quality, settings.resolution, settings.author) == ("draft", 512, "Another")
+
+
+def test_the_warning_sign_says_the_reason_and_chooses_the_region(settings, regions):
+    from types import SimpleNamespace
+
+    from material_palette.operators.regions import MATERIAL_PALETTE_OT_explain_region as Explain
+
+    regions[1].error = "Region 'right' is empty"
+    settings.active_region = 0
+    assert Explain.description(bpy.context, SimpleNamespace(index=1)) == "Region 'right' is empty"
+    assert Explain.description(bpy.context, SimpleNamespace(index=7)) == Explain.__doc__
+    assert bpy.ops.material_palette.explain_region(index=1) == {"FINISHED"}
+    assert settings.active_region == 1
+
+
 def test_tools_of_the_mouse_say_that_they_need_one(settings, regions):
     with pytest.raises(RuntimeError, match="needs a window"):
         bpy.ops.material_palette.draw_region(shape="BOX")
