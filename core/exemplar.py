@@ -14,6 +14,8 @@ from .outliers import find_foreign
 
 LARGEST = 1536  # px: side of what is cut at most; bounds the memory of learning
 NOISE_FLOOR = 2.5 / 255  # sRGB-encoded contrast below which a surface has one colour
+GREY = 0.46  # sRGB-encoded luminance of a photo's middle; where it is darker, so is all contrast
+GRAIN = 2.5  # times what white noise leaves after blurring is more than noise
 WHITE_BALANCES = ("off", "region")
 CLIPPED = 0.98  # linear; above it the camera saw white
 BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
@@ -171,6 +173,10 @@ def _uniform_colour(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray | None:
     median = np.median(values, 0)
     contrast = 1.4826 * np.median(np.abs(values - median), 0)
     tail = np.percentile(np.abs(values - median), 98, 0)
-    if (contrast > NOISE_FLOOR).any() or (tail > 4 * NOISE_FLOOR).any():
+    # less is more than noise only in a dark region, and only if it is not noise by its grain either
+    grain = 1.4826 * np.median(np.abs(encoded[mask] - values), 0) / (2 * np.sqrt(np.pi) * 1.5)
+    dark = np.maximum(NOISE_FLOOR * float(median @ LUMINANCE) / GREY, GRAIN * grain)
+    floor = np.minimum(NOISE_FLOOR, dark)
+    if (contrast > floor).any() or (tail > 4 * floor).any():
         return None
     return np.median(pixels[mask], 0).astype(np.float32)

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from .brdf import shade
+from .exemplar import LUMINANCE
 from .flip import flip
 from .image import linear_from_srgb, srgb_from_linear
 from .material import SVBRDF
@@ -39,6 +40,8 @@ MOST_PARTS = 4
 TEXELS_PER_PIXEL = tuple(float(f) for f in np.geomspace(0.5, 2.9, 16))  # tried where a scene is known
 PIXEL = 1.5  # px, width of a renderer's pixel filter
 SAMPLES = 4  # along a pixel's side, at most
+GREY = 0.18  # linear luminance that a close-up shows at least
+DARKEST = 0.004
 FAR = 0.02  # mean difference of maps that is seen without rendering them
 # (light, view), of any length: a sun from the side, a low one, and one that the viewer sees mirrored
 LIGHTS = (((-0.6, 0.5, 0.8), (0, 0, 1)), ((0.9, 0.3, 0.35), (0, 0, 1)), ((0.1, 0.9, 0.7), (0, -0.9, 0.7)))
@@ -310,8 +313,9 @@ def _folded(full: Maps, k: int) -> Maps | None:
 
 class _Judge:
     """The error of maps instead of the full ones: FLIP, mean over a window, in the worst of the windows in which one of
-    the maps changes most; the lights' mean, or their worst by WORST. `pixels` are the length of a tile; None: a pixel
-    per texel."""
+    the maps changes most; the lights' mean, or their worst by WORST. `pixels` are the length of a tile in a picture,
+    whose white is a white plane; None: a pixel per texel, in a close-up that is exposed for the material if it is dark.
+    """
 
     def __init__(self, full: Maps, pixels: float | None):
         self._full, self._pictures = full, {}
@@ -319,6 +323,8 @@ class _Judge:
         self._across = self._side if pixels is None else max(1, round(pixels))
         self._samples = max(1, math.ceil(self._side / self._across)) if self._side else 1
         self._window = min(WINDOW, self._across)
+        luminance = float((np.reshape(full["basecolor"], (-1, 3)) @ LUMINANCE).mean())
+        self._gain = max(1.0, GREY / max(luminance, DARKEST)) if pixels is None else 1.0
 
     def __call__(self, maps: Maps) -> float:
         full, worst = self._full, 0.0
@@ -357,7 +363,7 @@ class _Judge:
             light, view = (
                 torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float32), dim=0) for x in (light, view)
             )
-            shaded = shade(albedo, normal, roughness, light, view) / light[2]
+            shaded = shade(albedo, normal, roughness, light, view) * (self._gain / light[2])
             pictures.append(srgb_from_linear(filtered(shaded.clamp(0, 1).numpy(), n)))
         return pictures
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core.exemplar import cut_exemplar
-from material_palette.core.image import linear_from_srgb
+from material_palette.core.image import linear_from_srgb, srgb_from_linear
 from textures import pebbles
 
 
@@ -43,22 +43,29 @@ def test_without_flattening_the_photo_is_kept():
     assert np.array_equal(exemplar.pixels, pixels)
 
 
+@pytest.mark.parametrize("stops", [0, 4])
 @pytest.mark.parametrize("noise", [0.0, 4.0])
-def test_a_wall_of_one_colour_under_uneven_light_and_noise_is_uniform(noise):
+def test_a_wall_of_one_colour_under_uneven_light_and_noise_is_uniform(noise, stops):
     random = np.random.default_rng(1)
     colour = np.array([0.42, 0.2, 0.1], np.float32)
     light = np.linspace(0.8, 1.25, 150, dtype=np.float32)[:, None, None]
-    encoded = np.clip(np.broadcast_to(colour * light, (150, 150, 3)), 0, 1) ** (1 / 2.2)
+    encoded = np.clip(np.broadcast_to(colour * light / 2**stops, (150, 150, 3)), 0, 1) ** (1 / 2.2)
     noisy = np.rint(255 * encoded + noise * random.standard_normal(encoded.shape)) / 255
     uniform = cut_exemplar(linear_from_srgb(noisy), full(noisy)).uniform
     assert uniform is not None
-    assert np.allclose(uniform, linear_from_srgb(colour ** (1 / 2.2)), rtol=0.08)
+    assert np.allclose(uniform, linear_from_srgb((colour / 2**stops) ** (1 / 2.2)), rtol=0.08, atol=1e-3)
 
 
 @pytest.mark.parametrize("contrast", [0.06, 1.0])
 def test_a_texture_is_not_uniform(contrast):
     pixels = linear_from_srgb(0.4 + contrast * (pebbles(150, 150) - 0.4))
     assert cut_exemplar(pixels, full(pixels)).uniform is None
+
+
+def test_a_texture_in_a_dark_photo_is_not_uniform():
+    pixels = linear_from_srgb(0.4 + 0.06 * (pebbles(150, 150) - 0.4)) / 2**3
+    dark = linear_from_srgb(np.rint(srgb_from_linear(pixels) * 255) / np.float32(255))
+    assert cut_exemplar(dark, full(dark)).uniform is None
 
 
 def test_over_exposed_pixels_are_left_out_and_said():

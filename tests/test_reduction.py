@@ -47,6 +47,11 @@ def test_fine_colour_is_kept():
     assert reduce(SVBRDF(albedo, FLAT, 0.5)).svbrdf.albedo.shape == albedo.shape
 
 
+def test_a_dark_material_keeps_its_detail_in_a_close_up():
+    albedo = 0.004 + 0.02 * np.repeat(fine()[..., None], 3, -1)
+    assert reduce(SVBRDF(albedo, FLAT, 0.5)).svbrdf.albedo.shape == albedo.shape
+
+
 @pytest.mark.parametrize("pixels", [None, 2 * N, N // 2])
 def test_glossy_variation_of_the_roughness_is_kept(pixels):
     roughness = np.where(tileable_noise(N, N) > 0.5, 0.15, 0.6).astype(np.float32)
