@@ -270,6 +270,8 @@ def chart(rows: list[dict], path: Path) -> None:
     axes.axhline(0.02, color=charts.GREY, linewidth=0.8, linestyle=":")
     axes.axvline(4, color=charts.GREY, linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
+    axes.set_xticks([1, 2, 4, 8, 16], "1 2 4 8 16".split())
+    axes.minorticks_off()
     axes.set_xlabel("texture memory, times less than full (rings: as `fit` does it)")
     axes.set_ylabel("mean FLIP to the full palette")
     axes.legend(frameon=False, fontsize=7)
