@@ -142,11 +142,13 @@ def gradient_scores(spectra: Spectra, normal: np.ndarray) -> np.ndarray | None:
 def spectra_scores(spectra: Spectra, a: np.ndarray) -> np.ndarray:
     """(1 + BLOCKS,) the score of a surface given by its local maps (n, 2, 2), then with each block left out."""
     density = np.log(np.abs(np.linalg.det(a)))
-    k = np.einsum("nmi,nai->nma", spectra.frequency, a) * np.exp(-density.mean() / 2)
+    f, scale = spectra.frequency, np.exp(-density.mean() / 2)
+    # written out: a third of the time that einsum takes
+    kx, ky = ((f[..., 0] * a[:, i, :1] + f[..., 1] * a[:, i, 1:]) * scale for i in (0, 1))
     power = spectra.power - (density - density.mean())[:, None]
-    radius = np.log2(np.hypot(k[..., 0], k[..., 1])) / BIN
+    radius = np.log2(np.hypot(kx, ky)) / BIN
     radius -= np.floor(radius.min())
-    angle = np.arctan2(k[..., 1], k[..., 0]) * (ANGLES / np.pi)
+    angle = np.arctan2(ky, kx) * (ANGLES / np.pi)
     r, t = radius.astype(int), np.floor(angle).astype(int)
     dr, dt = radius - r, angle - t
     bins = (int(r.max()) + 2) * ANGLES
