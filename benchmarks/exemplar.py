@@ -299,7 +299,7 @@ def _quiet(fraction: float, message: str) -> None:
 
 SLANTS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 75.0)
 SLANT_CURVES = (
-    ("normal_error", "error of the normal where rectified, degrees"),
+    ("normal_error", "error of the normal, degrees"),
     ("claimed", "share rectified"),
     ("swd", "patch SWD to the flat texture"),
 )
