@@ -280,3 +280,27 @@ def test_weights_that_lack_tensors_are_said(loaded, tmp_path, photo):
     (tmp_path / "config.json").write_text((folder / "config.json").read_text())
     with pytest.raises(PaletteError, match="lack 1 tensors"):
         sam.Sam(tmp_path)
+
+
+def test_what_is_too_small_is_said(monkeypatch):
+    masks = [np.zeros((100, 100), bool) for _ in range(3)]
+    masks[0][:50], masks[1][60:66, :10], masks[2][80:81] = True, True, True  # half, too small, too thin
+
+    class Found:
+        def __init__(self, folder):
+            pass
+
+        def look(self, pixels):
+            pass
+
+        def everything(self, progress):
+            return masks
+
+    monkeypatch.setattr(sam, "Sam", Found)
+    words = []
+    (region,) = segment(np.full((100, 100, 3), 0.5, np.float32), engine="sam", warn=words.append)
+    assert (region.mask == masks[0]).all()
+    assert words == [
+        "2 parts of the photo, 1.6% of it together, are too small for a region and are left out. "
+        "Paint them to have them."
+    ]
