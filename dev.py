@@ -397,7 +397,8 @@ def test(arguments):
     return int(pytest.main(arguments))
 
 
-SUITES = ("texture", "exemplar", "svbrdf", "segmentation", "needs", "endtoend", "stability", "speed")
+# the longest first, for two at a time
+SUITES = ("endtoend", "speed", "stability", "exemplar", "texture", "svbrdf", "needs", "segmentation")
 WITH_DATA = ("exemplar", "svbrdf", "segmentation")  # have no data of their own
 
 
@@ -423,7 +424,7 @@ def bench(arguments):
         if options.quick:
             command.append("--quick")
         start = time.time()
-        print("==== {}".format(suite), flush=True)
+        print("==== {}\n".format(suite), end="", flush=True)
         with tempfile.TemporaryFile() as said:
             # one thread: torch's own wait on each other when a core is busy
             environment = dict(os.environ, OMP_NUM_THREADS="1")

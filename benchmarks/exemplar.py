@@ -436,9 +436,11 @@ def write_chart(summary: dict, folder: Path) -> None:
 
 
 def write_columns(textures: list[Texture], folder: Path, half_angle: float = 75.0, side: int = 448) -> None:
-    """columns.jpg: columns as they are seen, and what is learnt from; of textures with CC0 maps."""
-    rows = []
-    for i, texture in enumerate([t for t in textures if t.name.startswith("polyhaven/")][:4]):
+    """columns.jpg: columns as they are seen, and what is learnt from; of four textures with CC0 maps, if there are."""
+    rows, shown = [], [t for t in textures if t.name.startswith("polyhaven/")][:4]
+    if len(shown) < 4:
+        return
+    for i, texture in enumerate(shown):
         photo = curved(texture, half_angle, np.random.default_rng([i, 1]), side)
         found = rectification.rectify(photo.pixels, photo.mask, rectification.look(photo.pixels))
         exemplar = cut_exemplar(found.pixels, found.mask).picture()
