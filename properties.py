@@ -31,6 +31,7 @@ SEGMENTATIONS = (
 WHITE_BALANCES = (
     ("off", "As in the Photo", "Keep the photo's own white balance"),
     ("region", "Grey on Average", "Take the light's colour from the region: for plaster, concrete and other greys"),
+    ("card", "Grey Card", "Take the light's colour and brightness from a grey card: pick it with the eyedropper"),
 )
 RECTIFY = (
     ("auto", "Automatic", "Bring a slanted region to the front, by its corners or by the plane that is found"),
@@ -266,6 +267,16 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
     )
     white_balance: EnumProperty(
         name="White Balance", items=WHITE_BALANCES, description="What to do about the colour of the light"
+    )
+    grey_card: FloatVectorProperty(
+        name="Grey Card",
+        subtype="COLOR",
+        size=3,
+        min=0.0,
+        soft_max=1.0,
+        default=(0.18, 0.18, 0.18),
+        description="Colour of an 18 % grey card in the photo, or in one of the same light and exposure: base colours "
+        "become as bright as they are",
     )
     pack: BoolProperty(
         name="Pack Textures",

@@ -104,6 +104,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
     extract.add_argument("--white-balance", default="off", help="off, or region: the region is grey on average (off)")
+    extract.add_argument(
+        "--grey-card",
+        metavar="[PHOTO:]X,Y X,Y",
+        help="a rectangle in px on an 18 %% grey card, in each photo or in one of the same light and exposure: tells "
+        "how bright base colours are",
+    )
     diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)")
     diffusion.add_argument("--model", default="", help="folder in diffusers' format, .safetensors checkpoint or hub id")
     diffusion.add_argument("--online", action="store_true", help="fetch the model from the hub if it is not here")
@@ -263,10 +269,11 @@ def _jobs(arguments: argparse.Namespace) -> list[tuple[Path, Path | None, Path]]
 def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argparse.Namespace) -> int:
     from . import nodes
     from .annotations import read_annotations
+    from .exemplar import card_colour
     from .image import read_photo
     from .output import staged
     from .palette import Material, Settings, extract_palette, write_material, write_palette
-    from .region import add_geometry, file_name, parse_corners, parse_measure, read_regions
+    from .region import add_geometry, file_name, parse_card, parse_corners, parse_measure, read_regions
 
     settings = Settings(
         **_sampling(arguments),
@@ -280,6 +287,9 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         target_error=arguments.target_error,
     )
     settings.check()
+    card = parse_card(arguments.grey_card) if arguments.grey_card else None
+    if card and settings.white_balance != "off":
+        raise PaletteError("--grey-card and --white-balance both tell the light's colour; leave one out")
     corners = dict(parse_corners(text) for text in arguments.corners)
     measures = dict(parse_measure(text) for text in arguments.measure)
     line = _Line(photo_path.name)
@@ -288,6 +298,10 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         photo = read_photo(photo_path)
         for warning in photo.warnings:
             line.say(f"warning: {warning}")
+        if card:
+            shown = read_photo(card[0]) if card[0] else photo
+            colour = card_colour(shown.pixels, *(card[1] * shown.scale))
+            settings = replace(settings, white_balance="card", grey_card=colour)
         seconds = {"photo": time.perf_counter() - start}
         start = time.perf_counter()
         if masks is not None:

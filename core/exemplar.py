@@ -9,6 +9,7 @@ import numpy as np
 
 from .delighting import LUMINANCE as LUMINANCE
 from .delighting import find_light, masked_blur
+from .errors import PaletteError
 from .image import srgb_from_linear
 from .outliers import find_foreign
 
@@ -16,7 +17,9 @@ LARGEST = 1536  # px: side of what is cut at most; bounds the memory of learning
 NOISE_FLOOR = 2.5 / 255  # sRGB-encoded contrast below which a surface has one colour
 GREY = 0.46  # sRGB-encoded luminance of a photo's middle; where it is darker, so is all contrast
 GRAIN = 2.5  # times what white noise leaves after blurring is more than noise
-WHITE_BALANCES = ("off", "region")
+WHITE_BALANCES = ("off", "region", "card")
+GREY_CARD = 0.18  # reflectance of what photographers hold into the light
+UNEVEN = 0.3  # deviation over mean of a card's luminance; what varies more shows something else too
 CLIPPED = 0.98  # linear; above it the camera saw white
 BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
 PATCH = 7  # px: what an engine learns from at least
@@ -55,7 +58,7 @@ def cut_exemplar(
     pixels: np.ndarray,
     mask: np.ndarray,
     flatten: bool = True,
-    white_balance: str = "off",
+    white_balance: str | np.ndarray = "off",
     progress: Callable[[float, str], None] = lambda fraction, message: None,
 ) -> Exemplar:
     """Cut a region out of a photo, leave out what isn't fit to learn from, and flatten its illumination.
@@ -63,7 +66,8 @@ def cut_exemplar(
     pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel. Left out are pixels without colour (too
     bright or too dark for the camera), another material at the region's border and the borders of cast shadows. Of a
     region that spreads wider than LARGEST the fullest part is cut. With white_balance "region" the colour of the light
-    is taken from the region, whose mean is taken to be grey: for plaster, concrete, snow.
+    is taken from the region, whose mean is taken to be grey: for plaster, concrete, snow. White_balance (3,) is what
+    the photo shows of a grey card: then brightness and colour of the light are known.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -88,7 +92,12 @@ def cut_exemplar(
         if light.shaded:
             warnings.append(f"{light.shaded:.0%} of the region lies in a cast shadow; it was balanced with the rest")
             mask = _less(mask, light.unsure)
-    if white_balance == "region":
+    if isinstance(white_balance, np.ndarray):
+        shading = shading * (white_balance / GREY_CARD)
+        beyond = float(((pixels / shading)[mask] > 1).any(-1).mean())
+        if beyond > LEAST_SAID:
+            warnings.append(f"{beyond:.0%} of the region is brighter than white beside the grey card, and cut there")
+    elif white_balance == "region":
         mean = (pixels / shading)[mask].mean(0)
         shading = shading * (mean / max(float(mean @ LUMINANCE), 1e-6)).clip(1e-3)
     pixels = pixels / shading
@@ -99,6 +108,26 @@ def cut_exemplar(
     if float((pixels @ LUMINANCE)[mask].mean()) < DARK:
         warnings.append("the region is very dark; brighten the photo if its material is not that dark")
     return Exemplar(pixels, mask, shading, uniform, warnings)
+
+
+def card_colour(pixels: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, float, float]:
+    """What a photo (H, W, 3) float32 linear shows of a grey card: the mean of the rectangle between two points (x, y).
+
+    Raises PaletteError where the rectangle is empty, leaves the photo or holds no evenly lit card.
+    """
+    (left, top), (right, bottom) = np.minimum(first, second).astype(int), np.ceil(np.maximum(first, second)).astype(int)
+    h, w = pixels.shape[:2]
+    if left < 0 or top < 0 or right > w or bottom > h or left >= right or top >= bottom:
+        raise PaletteError(f"grey card: {left},{top} {right},{bottom} is no rectangle inside the photo's {w} x {h} px")
+    card = pixels[top:bottom, left:right].reshape(-1, 3)
+    luminance = card @ LUMINANCE
+    if (card >= CLIPPED).any(-1).mean() > LEAST_SAID:
+        raise PaletteError("grey card: it is over-exposed in the photo, which tells nothing; expose for the card")
+    if luminance.mean() < DARK:
+        raise PaletteError("grey card: it is too dark in the photo to tell the light; expose for the card")
+    if luminance.std() > UNEVEN * luminance.mean():
+        raise PaletteError("grey card: the rectangle shows more than an evenly lit card; choose a smaller one")
+    return tuple(float(x) for x in card.mean(0))
 
 
 def _sharpness(pixels: np.ndarray, mask: np.ndarray) -> float:

@@ -52,7 +52,8 @@ class Settings:
     resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object,
     where a region's measure does not tell; rectify: "auto" brings a slanted region to the front, by its corners or by
     the plane that is found, "quad" by its corners only, "off" never; flatten takes slow changes of light and cast
-    shadows out of a region; white_balance "region" takes the region's mean for grey. scale is how much larger the
+    shadows out of a region; white_balance "region" takes the region's mean for grey. "card"
+    takes grey_card, the linear colour of the photo's grey card, for a reflectance of 18 %. scale is how much larger the
     texture is shown than the photo shows it; the tile's area shrinks by as much. keep_concepts: each material's concept
     is kept and written, to sample others from. full_maps: nothing is reduced. target_error:
     each region's quality is the cheapest predicted to meet it (core/front.py), not `quality`. diffusion: settings of
@@ -67,6 +68,7 @@ class Settings:
     rectify: str = "auto"
     flatten: bool = True
     white_balance: str = "off"
+    grey_card: tuple[float, float, float] | None = None
     metres_per_tile: float = 1.0
     diffusion: DiffusionSettings | None = None
     scale: float = 1.0
@@ -92,6 +94,8 @@ class Settings:
             raise PaletteError(
                 f"white balance '{self.white_balance}' is unknown; choose one of: {', '.join(WHITE_BALANCES)}"
             )
+        if self.white_balance == "card" and not (self.grey_card and min(self.grey_card) > 0):
+            raise PaletteError("white balance 'card' needs the grey card's colour in the photo: name or pick the card")
         if self.target_error is not None:
             front.check(self.target_error)
             if self.engine != "patch":
@@ -510,7 +514,8 @@ def preview_exemplar(
 
 def _exemplar(flat: rectification.Rectification, settings: Settings, progress: Progress) -> Exemplar:
     progress(0.0, "cutting the exemplar")
-    return cut_exemplar(flat.pixels, flat.mask, settings.flatten, settings.white_balance, progress)
+    balance = np.float32(settings.grey_card) if settings.white_balance == "card" else settings.white_balance
+    return cut_exemplar(flat.pixels, flat.mask, settings.flatten, balance, progress)
 
 
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:

@@ -88,6 +88,12 @@ def parse_measure(text: str) -> tuple[str, tuple[np.ndarray, float]]:
     return _readable(name), (_points(points.split(), 2, text, usage), _metres(metres, text, usage))
 
 
+def parse_card(text: str) -> tuple[Path | None, np.ndarray]:
+    """(photo, two corners (2, 2)) of "x,y x,y" or "photo:x,y x,y", a grey card's place. Raises PaletteError."""
+    photo, _, points = text.rpartition(":")
+    return Path(photo) if photo else None, _points(points.split(), 2, text, "[PHOTO:]X,Y X,Y")
+
+
 def add_geometry(regions: list[Region], corners: dict, measures: dict, scale: float = 1.0) -> None:
     """Give regions their corners and measures, by name, in px of a photo `scale` times smaller than its file.
 

@@ -6,7 +6,7 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from .background import BackgroundOperator
-from .extract import nearest
+from .extract import light, nearest
 from .photo import photo_reader
 from .regions import image_editor, read_mask_image
 
@@ -27,7 +27,7 @@ class MATERIAL_PALETTE_OT_preview_exemplar(BackgroundOperator, Operator):
         if region.mask is not None and tuple(region.mask.size) != tuple(settings.photo.size):
             raise PaletteError(f"Region '{region.name}': its mask isn't of the photo's size; paint it anew")
         read, name, mask = photo_reader(settings.photo), region.name, read_mask_image(region)
-        chosen = {"flatten": settings.flatten, "white_balance": settings.white_balance}
+        chosen = light(settings)
 
         def work(progress, send):
             progress(0.0, "Reading the photo")

@@ -254,6 +254,12 @@ def sampling(settings, seed):
     }
 
 
+def light(settings):
+    """What the scene says of the photo's light, as `core.palette.Settings` take it."""
+    card = tuple(settings.grey_card) if settings.white_balance == "card" else None
+    return {"flatten": settings.flatten, "white_balance": settings.white_balance, "grey_card": card}
+
+
 def _keep_concept(material, made, kept):
     """Put the concept that was written beside a material's maps, or that it was sampled from, into the material."""
     from ..core.region import file_name
@@ -272,8 +278,7 @@ def _read_order(settings, regions, seed, is_whole):
     chosen = sampling(settings, seed) | {
         "engine": settings.engine,
         "rectify": settings.rectify,
-        "flatten": settings.flatten,
-        "white_balance": settings.white_balance,
+        **light(settings),
         "metres_per_tile": settings.metres_per_tile,
         "keep_concepts": settings.keep_concepts and settings.engine == "patch",
         "target_error": (settings.target_error or None) if settings.engine == "patch" else None,

@@ -200,6 +200,8 @@ class OptionsPanel:
         column.prop(settings, "focal_length")
         column.prop(settings, "flatten")
         column.prop(settings, "white_balance")
+        if settings.white_balance == "card":
+            column.prop(settings, "grey_card")
         layout.operator("material_palette.preview_exemplar", icon="IMAGE_BACKGROUND")
         kept = column.row()
         kept.active = settings.engine == "patch"

@@ -9,6 +9,7 @@ from textures import pebbles
 
 pytest.importorskip("bpy", reason="palette.blend is written by Blender")
 from material_palette.core.command import main  # noqa: E402
+from material_palette.core.image import linear_from_srgb  # noqa: E402
 from material_palette.core.tensors import write_tensors  # noqa: E402
 
 
@@ -48,6 +49,24 @@ def test_a_palette_is_written(inputs, capsys):
     # the masks that were used can be passed back
     assert extract(inputs, masks="out/masks", out="again") == 0
     assert (inputs / "again/a/a_basecolor.png").read_bytes() == (out / "a/a_basecolor.png").read_bytes()
+
+
+def test_a_grey_card_in_another_photo_sets_how_bright_base_colours_are(inputs, capsys):
+    cv2.imwrite(str(inputs / "card.png"), np.full((50, 60, 3), 162, np.uint8))  # linear 0.36: twice as bright as it is
+
+    def mean(out):
+        encoded = cv2.imread(str(inputs / out / "a/a_basecolor.png")) / 255
+        return float(np.mean(linear_from_srgb(encoded)))
+
+    card = f"{inputs / 'card.png'}:5,5 50,40"
+    assert extract(inputs) == extract(inputs, "--grey-card", card, out="lit") == 0
+    assert mean("lit") / mean("out") == pytest.approx(0.5, rel=0.1)
+    settings = json.loads((inputs / "lit/palette.json").read_text(encoding="utf-8"))["settings"]
+    assert settings["white_balance"] == "card" and settings["grey_card"] == pytest.approx([0.36] * 3, abs=0.005)
+    for wrong, words in (("5,5", "X,Y X,Y"), ("5,5 500,40", "inside the photo's 200 x 120 px")):
+        assert extract(inputs, "--grey-card", wrong, out="none") == 2 and words in capsys.readouterr().err
+    assert extract(inputs, "--grey-card", card, "--white-balance", "region", out="none") == 2
+    assert "leave one out" in capsys.readouterr().err and not (inputs / "none").exists()
 
 
 def spoil(name):

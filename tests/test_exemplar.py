@@ -1,7 +1,8 @@
 import cv2
 import numpy as np
 import pytest
-from material_palette.core.exemplar import cut_exemplar
+from material_palette.core.errors import PaletteError
+from material_palette.core.exemplar import card_colour, cut_exemplar
 from material_palette.core.image import linear_from_srgb, srgb_from_linear
 from textures import pebbles
 
@@ -119,6 +120,37 @@ def test_white_balance_makes_the_regions_mean_grey_and_nothing_else():
     assert np.ptp(off.pixels[off.mask].mean(0)) > 0.05
     assert np.ptp(region.pixels[region.mask].mean(0)) < 0.002
     assert np.allclose(region.pixels * region.shading, photo, rtol=1e-4)
+
+
+def test_a_grey_card_tells_brightness_and_colour_of_the_light():
+    albedo = linear_from_srgb(0.2 + 0.3 * pebbles(160, 160)).astype(np.float32)
+    light = np.float32([1.9, 1.4, 0.8])
+    scene = np.concatenate([albedo, np.full((40, 160, 3), 0.18, np.float32)]) * light
+    card = card_colour(scene, np.array([8, 164]), np.array([150, 196]))
+    mask = np.zeros(scene.shape[:2], bool)
+    mask[:160] = True
+    found = cut_exemplar(scene, mask, white_balance=np.float32(card))
+    assert np.allclose(found.pixels[found.mask].mean(0), albedo[found.mask[:160]].mean(0), rtol=0.03)
+    assert not found.warnings
+    darker = cut_exemplar(scene, mask, white_balance=np.float32(card) / 10)
+    assert any("brighter than white beside the grey card" in warning for warning in darker.warnings)
+
+
+@pytest.mark.parametrize(
+    "corners, words",
+    [
+        (((0, 0), (0, 40)), "no rectangle"),
+        (((100, 100), (300, 140)), "no rectangle inside the photo's 160 x 200 px"),
+        (((0, 160), (50, 200)), "over-exposed"),
+        (((50, 160), (100, 200)), "too dark"),
+        (((0, 0), (160, 160)), "more than an evenly lit card"),
+    ],
+)
+def test_what_tells_no_light_is_no_grey_card(corners, words):
+    photo = np.concatenate([linear_from_srgb(0.1 + 0.7 * pebbles(160, 160)), np.full((40, 160, 3), 0.001)])
+    photo[160:, :50] = 1.0
+    with pytest.raises(PaletteError, match=words):
+        card_colour(photo.astype(np.float32), *np.array(corners))
 
 
 def test_a_blurred_region_and_a_dark_one_are_said():

@@ -182,6 +182,8 @@ def test_cancelling_takes_half_a_second_at_most():
         ({"resolution": 9000}, "64 to 8192"),
         ({"seed": -1}, "seed -1"),
         ({"white_balance": "warm"}, "white balance 'warm'"),
+        ({"white_balance": "card"}, "needs the grey card's colour"),
+        ({"white_balance": "card", "grey_card": (0.2, 0.0, 0.1)}, "needs the grey card's colour"),
         ({"metres_per_tile": float("nan")}, "metres per tile"),
     ],
 )
