@@ -51,7 +51,8 @@ FOUND = 0.1  # IoU from which on an automatic region counts as a part's
 QUALITIES = ("draft", "balanced", "best")
 DECOMPOSERS = ("unet", "analytic")
 OURS = "ours, balanced, unet"
-GREY_CARD = ", exposure known"  # rows of which the photo's exposure is right in the mean of its parts
+EXPOSED = ", exposure known"  # rows of which the photo's exposure is right in the mean of its parts
+CARD = ", grey card"  # rows that have a second photo, with a grey card in it
 AGAIN = (OURS, "ours, auto regions", "true class", "other class", "mean colour", "square crop")  # rendered again
 MEASURES = {
     "A": "albedo, ST-LPIPS",
@@ -152,9 +153,11 @@ def _quiet(fraction: float, message: str) -> None:
     pass
 
 
-def extracted(photo, mask, shown, part, quality, decomposers, view, resolution) -> dict[str, Found]:
-    """By decomposer what the product finds in a region; shown and part say how large a metre is there."""
-    settings = palette.Settings(quality=quality, decomposer="kept", resolution=resolution)
+def extracted(photo, mask, shown, part, quality, decomposers, view, resolution, card=None) -> dict[str, Found]:
+    """By decomposer what the product finds in a region; shown and part say how large a metre is there; card is what
+    the photo shows of a grey card."""
+    light = {"white_balance": "card", "grey_card": card} if card else {}
+    settings = palette.Settings(quality=quality, decomposer="kept", resolution=resolution, **light)
     _kept.clear()
     start = time.process_time()
     material = palette.extract_material(photo, Region(part, mask), settings, _quiet, view)
@@ -170,20 +173,21 @@ def extracted(photo, mask, shown, part, quality, decomposers, view, resolution) 
     return found
 
 
-def rows_of(number, shown, part, tile, truth: Known, every, view, auto, options, random) -> dict[str, Found]:
+def rows_of(number, shown, part, tile, truth: Known, every, view, auto, card, options, random) -> dict[str, Found]:
     """All answers for one part, by row; a row that fails says so and is missing."""
     photo, mask = shown.photo, shown.masks[part]
     rows: dict[str, Found] = {}
 
-    def take(label, mask, quality, decomposers):
+    def take(label, mask, quality, decomposers, card=None):
         try:
-            found = extracted(photo, mask, shown, part, quality, decomposers, view, options.resolution)
+            found = extracted(photo, mask, shown, part, quality, decomposers, view, options.resolution, card)
             rows.update({label.format(name): one for name, one in found.items()})
         except PaletteError as error:
             print(f"{part}, {label}: {error}")
 
     for quality in QUALITIES if number < options.presets else QUALITIES[1:2]:
         take(f"ours, {quality}, {{}}", mask, quality, DECOMPOSERS)
+    take("ours, balanced, {}" + CARD, mask, "balanced", DECOMPOSERS[:1], card)
     if auto is not None:
         take("ours, auto regions", auto, "balanced", DECOMPOSERS[:1])
     same, other = by_class(truth, every)
@@ -198,6 +202,8 @@ def rows_of(number, shown, part, tile, truth: Known, every, view, auto, options,
     crop = np.ascontiguousarray(photo[largest_square(mask)])
     density = scenes.texels_per_metre(shown, part)
     rows["square crop"] = Found(SVBRDF(crop, FLAT, ROUGHNESS), density, time.process_time() - start)
+    lit = np.clip(crop * (np.float32(scenes.GREY_CARD) / np.float32(card)), 0, 1)
+    rows["square crop" + CARD] = Found(SVBRDF(lit, FLAT, ROUGHNESS), density)
     return rows
 
 
@@ -273,7 +279,7 @@ def compare_pictures(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
 
 def add_exposed(row: str, answers: dict[str, dict[str, Found]], truth: dict[str, SVBRDF]) -> None:
     """Add a row whose base colours have the factor, one for the scene, that makes them right in the mean of its parts:
-    what is left of the error when a grey card tells the exposure."""
+    what is left of the error when something tells the exposure."""
     parts = [part for part, found in answers.items() if row in found]
     level = {part: float(mean_colour(answers[part][row].maps) @ LUMINANCE) for part in parts}
     true = {part: float(mean_colour(truth[part]) @ LUMINANCE) for part in parts}
@@ -281,7 +287,7 @@ def add_exposed(row: str, answers: dict[str, dict[str, Found]], truth: dict[str,
     for part in parts:
         found = answers[part][row]
         maps = replace(found.maps, albedo=np.clip(found.maps.albedo * np.float32(gain), 0, 1))
-        answers[part][row + GREY_CARD] = replace(found, maps=maps)
+        answers[part][row + EXPOSED] = replace(found, maps=maps)
 
 
 def automatic(shown: scenes.Shown) -> tuple[dict[str, np.ndarray], dict[str, float]]:
@@ -318,11 +324,14 @@ def run_scene(number: int, tested, every, options, keep: Path) -> dict:
     across = scenes.KINDS[kind]
     tiles = {part: tile_of(maps, across[part]) for part, maps in truth.items()}
     view = palette.rectification.look(shown.photo)
+    card = scene.show_card(shown.gain)
     auto, ious = automatic(shown) if options.auto else ({}, {})
     result, answers = {"kind": kind, "parts": [], "again": []}, {}
     for i, part in enumerate(shown.masks):
         random = np.random.default_rng([number, i])
-        found = rows_of(number, shown, part, across[part], parts[part], every, view, auto.get(part), options, random)
+        found = rows_of(
+            number, shown, part, across[part], parts[part], every, view, auto.get(part), card, options, random
+        )
         answers[part] = found
         print(f"  {part}: {parts[part].name}, {len(found)} rows", flush=True)
     for row in (OURS, "square crop"):

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 
+from ..core.exemplar import GREY_CARD, card_colour
 from ..core.image import linear_from_srgb, srgb_from_linear
 from ..core.material import SVBRDF
 
@@ -39,6 +40,8 @@ KINDS = {
     "facade": {"wall": 1.9, "ground": 1.9, "plinth": 1.0, "column": 1.0},
     "table": {"top": 0.55, "crate": 0.3, "drum": 0.3, "ball": 0.35},
 }
+# a grey card that is held into the scene, facing the camera: place of its middle, side
+CARDS = {"room": ((0.0, -0.4, 0.8), 0.3), "facade": ((0.0, -1.7, 1.2), 0.4), "table": ((0.0, -0.1, 0.17), 0.12)}
 # camera: place, target
 VIEWS = {
     "room": [((-0.3, -3.3, 1.5), (0.1, 1.2, 0.75)), ((0.9, -3.2, 1.35), (-0.4, 1.2, 0.8))],
@@ -275,6 +278,26 @@ class Scene:
             if mask.sum() >= LEAST_AREA:
                 masks[part] = mask
         return Shown(exposed(radiance, gain), masks, layers["uv"], float(gain))
+
+    def show_card(self, gain: float) -> tuple[float, float, float]:
+        """What a photo of this exposure shows of a grey card that is held into the scene, linear; it is gone again."""
+        bpy, (place, side) = self.bpy, CARDS[self.kind]
+        card = _mesh(bpy, "card", [_rectangle((-side / 2, -side / 2, 0), (side, 0, 0), (0, side, 0))])
+        card.location, card.rotation_euler = place, bpy.context.scene.camera.rotation_euler
+        card.pass_index = len(self.things) + 1
+        material = bpy.data.materials.new("card")
+        material.use_nodes = True
+        shader = material.node_tree.nodes["Principled BSDF"]
+        shader.inputs["Base Color"].default_value = (*[GREY_CARD] * 3, 1)
+        shader.inputs["Roughness"].default_value, shader.inputs["Specular IOR Level"].default_value = 1.0, 0.0
+        card.data.materials.append(material)
+        bpy.context.scene.render.resolution_percentage = 100
+        index = self._rendered(1, False)[1]["index"]
+        photo = exposed(self.render(), gain)
+        bpy.data.objects.remove(card)
+        y, x = np.nonzero(np.round(index) == len(self.things) + 1)
+        (top, bottom), (left, right) = (np.quantile(v, (0.2, 0.8)) for v in (y, x))
+        return card_colour(photo, np.array([left, top]), np.array([right, bottom]))
 
     def _rendered(self, samples: int, smooth: bool) -> tuple[np.ndarray, dict]:
         scene = self.bpy.context.scene

@@ -35,7 +35,7 @@ if "material_palette" not in sys.modules:
     import dev
 
     dev.load_package()
-from material_palette.benchmarks import charts  # noqa: E402
+from material_palette.benchmarks import charts, rivals  # noqa: E402
 from material_palette.benchmarks.records import command, commit, machine  # noqa: E402
 from material_palette.core import brdf, decomposition, perceptual  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
@@ -297,6 +297,12 @@ def product(name: str) -> Callable:
     return row
 
 
+def deep_materials(prior: Prior, weights: Path | None) -> Decompose:
+    if weights is None:
+        raise SystemExit("row 'deep-materials' needs the weights that training/train.py makes: deep-materials=FILE")
+    return lambda texture: rivals.deep_materials(texture, weights)
+
+
 ROWS = {
     "constant prior": constant_prior,
     "nothing": nothing,
@@ -304,8 +310,9 @@ ROWS = {
     "analytic": product("analytic"),
     "unet": product("unet"),
     "resnet101": product("resnet101"),
+    "deep-materials": deep_materials,
 }
-DEFAULT = tuple(name for name in ROWS if name != "resnet101")
+DEFAULT = tuple(ROWS)[:5]
 LABELS = {"nothing": "photo as albedo, flat"}
 
 

@@ -2,7 +2,8 @@
 
 A small U-Net learns what shading does from pixel to pixel. Features of a pretrained trunk, seen at half resolution,
 tell it what it looks at, and what all of the picture has in common (the material, where the light comes from) scales
-and shifts its features. Every head starts from "do nothing": albedo as photographed, flat. Roughness is one number.
+and shifts its features. What is shaded slopes along the light, whose direction is found first: one head is multiplied
+by it. Every head starts from "do nothing": albedo as photographed, flat. Roughness is one number.
 """
 
 import torch
@@ -16,7 +17,8 @@ MATERIAL = 2 * CHANNELS[-1]  # mean and deviation of the trunk's deepest feature
 TEXTURE = 2 * sum(CHANNELS[2:4])  # and of those before: less of what it is, more of what it is made of
 WIDTHS = (32, 48, 64, 96)  # at 1/2, 1/4, 1/8, 1/16
 LIGHT = 2 * sum(WIDTHS[1:])  # mean and deviation of the U-Net's own
-HEADS = {"gain": 3, "slope": 2}
+HEADS = {"gain": 3, "slope": 2, "shade": 1}
+WHOLE = 128
 
 
 class SvbrdfNet(nn.Module):
@@ -34,7 +36,8 @@ class SvbrdfNet(nn.Module):
             below = width
         self.material = nn.Linear(MATERIAL, 64)
         self.light = nn.Linear(LIGHT, 64)
-        self.scale = nn.Linear(128, 2 * sum(WIDTHS))
+        self.lamp = nn.Linear(WHOLE, 2)
+        self.scale = nn.Linear(WHOLE, 2 * sum(WIDTHS))
         self.lift = nn.ModuleList(nn.Conv2d(WIDTHS[i + 1], WIDTHS[i], 1) for i in range(3))
         for width in WIDTHS:
             self.up.append(nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(2)))
@@ -51,7 +54,7 @@ class SvbrdfNet(nn.Module):
         """pixels (B, 3, H, W) sRGB-encoded in [0, 1], sides multiples of STRIDE; whole (B, 128), of `describe`.
 
         Returns gain (B, 3, H, W), the logarithm of albedo over linear pixels; slope (B, 2, H, W), d height / dx and
-        d height / d row per pixel.
+        d height / d row per pixel; lamp (B, 2), where the light comes from, along x and down, as a share of all light.
         """
         maps = self._trunk(pixels, 3 if whole is not None else 5)
         levels = self._encode(pixels, maps)
@@ -67,8 +70,9 @@ class SvbrdfNet(nn.Module):
                 x = x + F.relu(convolution(x))
             if level:
                 x = self.lift[level - 1](x)
-        out = F.pixel_shuffle(self.heads(x), 2)
-        return dict(zip(HEADS, out.split(list(HEADS.values()), 1), strict=True))
+        gain, slope, shade = F.pixel_shuffle(self.heads(x), 2).split(list(HEADS.values()), 1)
+        lamp = self.lamp(whole)
+        return {"gain": gain, "slope": slope + shade * lamp[..., None, None], "lamp": lamp}
 
     @torch.no_grad()
     def describe(self, samples: torch.Tensor, material: torch.Tensor) -> torch.Tensor:

@@ -13,6 +13,7 @@ from material_palette.core.torus import integrate
 from materials import MaterialSet
 
 MOST_SLOPE = 4.0
+VECTORS = ("slope", "lamp")  # what turns with the picture
 # deviation of the logarithm of exposure: nothing in a picture tells it from a brighter material, so the albedo keeps
 # the photo's. A network that expects more of it draws bright and dark materials to the mean of what it knows
 EXPOSURE = 0.04
@@ -107,17 +108,17 @@ def stacked(crops: list[dict[str, np.ndarray]]) -> dict[str, torch.Tensor]:
 
 
 def turned(batch: dict[str, torch.Tensor], random: np.random.Generator) -> dict[str, torch.Tensor]:
-    """The batch mirrored and transposed at random, the slopes with it."""
+    """The batch mirrored and transposed at random, the slopes and where light comes from with it."""
     batch = dict(batch)
     for axis in (3, 2):
         if random.random() < 0.5:
             batch = {name: x.flip(axis) for name, x in batch.items()}
             sign = torch.ones(1, 2, 1, 1)
             sign[:, 3 - axis] = -1
-            batch["slope"] = batch["slope"] * sign
+            batch |= {name: batch[name] * sign for name in VECTORS if name in batch}
     if random.random() < 0.5:
         batch = {name: x.transpose(2, 3) for name, x in batch.items()}
-        batch["slope"] = batch["slope"].flip(1)
+        batch |= {name: batch[name].flip(1) for name in VECTORS if name in batch}
     return batch
 
 
@@ -137,6 +138,11 @@ def normal_of(slope: torch.Tensor) -> torch.Tensor:
 
 def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) -> torch.Tensor:
     """Photos (B, 3, S, S), sRGB-encoded in [0, 1], of a batch: sun, lamp, sky, crevices, camera."""
+    return lit(batch, random)[0]
+
+
+def lit(batch: dict[str, torch.Tensor], random: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Photos as of `photographed`, and where their light comes from, (B, 2, 1, 1): along x and down, weighted."""
     count, _, size, _ = batch["albedo"].shape
     generator = torch.Generator().manual_seed(int(random.integers(2**62)))
 
@@ -153,7 +159,7 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
     place = torch.stack([axis.expand(size, size), -axis[:, None].expand(size, size), torch.zeros(size, size)], -1)
     aside = torch.cat([uniform(-0.35, 0.35, 2), torch.ones(count, 1, 1, 1)], 1) * uniform(1.5, 6.0, 1)
     view = _unit(last(aside) - place)
-    total = torch.zeros_like(albedo)
+    total, lamps = torch.zeros_like(albedo), torch.zeros(count, 2, 1, 1)
     weight = torch.zeros(count, 1, 1, 1)
     for lamp in range(2 if random.random() < 0.2 else 1):
         azimuth, elevation = uniform(0, 2 * np.pi, 1), uniform(0.35, 1.0, 1)
@@ -169,6 +175,8 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
         cosine = direction[..., 2:]
         total = total + share * colour * lit / cosine
         weight = weight + share
+        across = direction[..., :2] * torch.tensor([1.0, -1.0])  # rows go down
+        lamps = lamps + (share * across / cosine).movedim(-1, 1)
     # the sky: what a normal sees of the hemisphere, less in crevices; a mirror sees it too
     height = batch["height"][:, 0]
     hidden = sum((_blurred(height, sigma) - height).clamp_min(0) / sigma for sigma in (1.5, 4.0, 12.0))
@@ -179,13 +187,13 @@ def photographed(batch: dict[str, torch.Tensor], random: np.random.Generator) ->
     dielectric = albedo * (1 - metallic[..., None]) + brdf.F0
     sky = last(uniform(0.15, 1.0, 1))
     total = total + sky * crevices * open_sky * (dielectric + metallic[..., None] * albedo)
-    total = total / (weight + sky)
+    total, lamps = total / (weight + sky), lamps / (weight + sky)
     # exposure, and what is left of vignetting and of illumination after it was flattened
     drift = torch.randn(count, 1, 3, 3, generator=generator)
     drift = F.interpolate(drift, (size, size), mode="bicubic", align_corners=True)[:, 0, ..., None]
     exposure = torch.exp(EXPOSURE * torch.randn(count, 1, 1, 1, generator=generator))
     total = total * exposure * torch.exp(0.06 * drift)
-    return torch.stack([torch.from_numpy(_camera(x, random)) for x in total.numpy()]).movedim(-1, 1)
+    return torch.stack([torch.from_numpy(_camera(x, random)) for x in total.numpy()]).movedim(-1, 1), lamps
 
 
 def _camera(linear: np.ndarray, random: np.random.Generator) -> np.ndarray:

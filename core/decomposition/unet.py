@@ -31,9 +31,9 @@ HALO = 96  # px: what is farther away changes a pixel by less than a grey level 
 OVERVIEW = 256  # px: longer side of what the material is recognised in
 SAMPLE = 192  # px: side of each of at most four samples of which the light is read
 STEEPEST = 4.0
-# the network says what is likely on average, which is nearly flat where it is unsure; times this the relief of
-# materials it has not seen is half as steep as measured, and pictures under other lights are no farther off (FLIP)
-RELIEF = 4.0
+# of the slopes: the most at which, on materials left out of training, their squared error is not above that of a flat
+# surface (training/calibrate.py). They are flatter than true ones where the network is unsure
+RELIEF = 1.0
 # of what it takes for light, this share is taken out of the albedo: as near to the truth as all of it on materials left
 # out of training (CIEDE2000 3.5 to 3.6), and half the harm to pictures that had no shading (1.5 to 2.8)
 GAIN = 0.5
@@ -41,8 +41,17 @@ DARKEST = 1e-3  # linear, as in training
 FAINT = 0.03  # deviation of the encoded pixels below which there is ever less to see, and the network is believed less
 
 
-def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weights: Path = WEIGHTS) -> SVBRDF:
-    """See `core.decomposition.decompose`. Peak memory beyond the maps: about 0.3 GB a thread."""
+def decompose(
+    texture: np.ndarray,
+    progress: Callable[[float, str], None],
+    weights: Path = WEIGHTS,
+    relief: float = RELIEF,
+    share: float = GAIN,
+) -> SVBRDF:
+    """See `core.decomposition.decompose`. Peak memory beyond the maps: about 0.3 GB a thread.
+
+    relief: factor on the slopes that are found; share: of what is taken for light, what is taken out of the albedo.
+    """
     net = load(weights)
     progress(0.0, "recognising the material")
     origin = _origin(texture)
@@ -55,7 +64,7 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None], weigh
         mean = net.mean_roughness(kind).clamp(LEAST_ROUGHNESS, 1).item()
     progress(0.8, "integrating the height")
     out *= min(1.0, float(encoded.std((0, 1)).max()) / FAINT)
-    gain, slope = GAIN * out[..., :3], (RELIEF * out[..., 3:]).clamp(-STEEPEST, STEEPEST)
+    gain, slope = share * out[..., :3], (relief * out[..., 3:]).clamp(-STEEPEST, STEEPEST)
     albedo = (torch.from_numpy(texture).clamp_min(DARKEST) * torch.exp(gain)).clamp(0, 1)
     height = integrate(slope[..., 0], slope[..., 1]) / texture.shape[1]
     progress(0.9, "computing normals")
