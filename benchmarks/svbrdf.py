@@ -303,16 +303,24 @@ def deep_materials(prior: Prior, weights: Path | None) -> Decompose:
     return lambda texture: rivals.deep_materials(texture, weights)
 
 
+def as_found(prior: Prior, weights: Path | None) -> Decompose:
+    """The network's slopes as they are, and all that it takes for light taken out: what squared error wants."""
+    return lambda texture: decomposition.unet.decompose(
+        texture, _quiet, weights or decomposition.unet.WEIGHTS, relief=1.0, share=1.0
+    )
+
+
 ROWS = {
     "constant prior": constant_prior,
     "nothing": nothing,
     "luminance-to-normal": luminance_to_normal,
     "analytic": product("analytic"),
+    "unet as found": as_found,
     "unet": product("unet"),
     "resnet101": product("resnet101"),
     "deep-materials": deep_materials,
 }
-DEFAULT = tuple(ROWS)[:5]
+DEFAULT = tuple(ROWS)[:6]
 LABELS = {"nothing": "photo as albedo, flat"}
 
 
