@@ -34,8 +34,8 @@ STEEPEST = 4.0
 # times the slopes: the network says what is likely on average, flatter than true where it is unsure. On materials
 # left out of training (training/calibrate.py) squared error wants 0.5, the median and the mean of ST-LPIPS 1.25 and 2
 RELIEF = 1.5
-# of what it takes for light, this share is taken out of the albedo: as near to the truth as all of it on materials left
-# out of training (CIEDE2000 3.5 to 3.6), and half the harm to pictures that had no shading (1.5 to 2.8)
+# of what it takes for light, this share is taken out of the albedo: on materials left out of training as near to the
+# truth as all of it (CIEDE2000 3.3; as photographed 4.1), and half the harm to what had no shading (1.5 to 2.8)
 GAIN = 0.5
 DARKEST = 1e-3  # linear, as in training
 FAINT = 0.03  # deviation of the encoded pixels below which there is ever less to see, and the network is believed less
