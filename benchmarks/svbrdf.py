@@ -304,9 +304,9 @@ def deep_materials(prior: Prior, weights: Path | None) -> Decompose:
 
 
 def as_found(prior: Prior, weights: Path | None) -> Decompose:
-    """The network's slopes as they are, and all that it takes for light taken out: what squared error wants."""
+    """The network's slopes alone, and all that it takes for light taken out: what squared error wants."""
     return lambda texture: decomposition.unet.decompose(
-        texture, _quiet, weights or decomposition.unet.WEIGHTS, relief=1.0, share=1.0
+        texture, _quiet, weights or decomposition.unet.WEIGHTS, share=1.0, guess=0.0
     )
 
 

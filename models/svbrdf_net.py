@@ -44,9 +44,10 @@ class SvbrdfNet(nn.Module):
         self.heads = nn.Conv2d(WIDTHS[0], 4 * sum(HEADS.values()), 3, padding=1)
         # fitted apart, in closed form: there are few materials to learn from
         self.mean_roughness = nn.Linear(TEXTURE, 1)
-        for layer in (self.heads, self.scale):
+        for layer in (self.heads, self.scale, self.mean_roughness):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
+        nn.init.constant_(self.mean_roughness.bias, 0.6)  # until it is fitted
         self.trunk.requires_grad_(False)
         self.mean_roughness.requires_grad_(False)
 

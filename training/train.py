@@ -164,7 +164,7 @@ def target_sets(folder: Path, weights: Path | None) -> list[MaterialSet]:
         pixels = read_pixels(path)
         if weights:
             texture = linear_from_srgb(pixels.astype(np.float32) / 255)
-            maps = _bytes(unet.decompose(texture, lambda fraction, message: None, weights, LABELLED, 1.0))
+            maps = _bytes(unet.decompose(texture, lambda fraction, message: None, weights, LABELLED, 1.0, 0.0))
         else:
             maps = pixels, np.full_like(pixels, (128, 128, 255)), np.full(pixels.shape[:2], 153, np.uint8), None
         sets.append(MaterialSet(f"target/{path.stem}", *maps, True))
@@ -206,6 +206,7 @@ class Run:
         self.average = {name: p.detach().clone() for name, p in self.learnt.items()}
 
     def find(self, pixels: torch.Tensor) -> dict[str, torch.Tensor]:
+        """What `answers` makes of the network's answer to pixels (B, 3, S, S), sRGB-encoded."""
         with torch.autocast("cpu", torch.bfloat16):
             out = self.net(pixels)
         return answers(out, pixels)

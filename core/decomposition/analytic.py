@@ -38,7 +38,7 @@ def decompose(texture: np.ndarray, progress: Callable[[float, str], None]) -> SV
     progress(0.4, "separating shading and albedo")
     albedo = (pixels * torch.exp(-SHADING * shading)[..., None]).clamp(0, 1)
     progress(0.5, "integrating the height")
-    height = _relief(shading) / pixels.shape[1]
+    height = _relief(shading)
     progress(0.8, "computing normals")
     normal = normal_from_height(height)
     progress(1.0, "computing normals")
@@ -58,6 +58,11 @@ def vary(mean: float, albedo: torch.Tensor) -> torch.Tensor:
     return varied.clamp(LEAST_ROUGHNESS, 1)
 
 
+def relief(pixels: torch.Tensor) -> torch.Tensor:
+    """Height (H, W) in tile widths of linear pixels (H, W, 3), which wrap, as `decompose` finds it."""
+    return _relief(_shading(pixels))
+
+
 def _shading(pixels: torch.Tensor) -> torch.Tensor:
     """Logarithm of the shading (H, W), mean 0."""
     luminance = torch.log(pixels @ torch.from_numpy(LUMINANCE) + DARKEST)
@@ -71,9 +76,9 @@ def _shading(pixels: torch.Tensor) -> torch.Tensor:
 
 
 def _relief(shading: torch.Tensor) -> torch.Tensor:
-    """Height (H, W) in pixels. Divided by frequency: a dark spot of any size is a dent of the same slope."""
+    """Height (H, W) in tile widths. Divided by frequency: a dark spot of any size is a dent of the same slope."""
     v, u = frequencies(*shading.shape)
     frequency = torch.sqrt(u**2 + v**2)
     longest = LONGEST * 2 * torch.pi / min(shading.shape)
     band = frequency**2 / (frequency**2 + longest**2) / (frequency + 0.05)
-    return RELIEF * torch.fft.irfft2(torch.fft.rfft2(shading) * band, s=shading.shape)
+    return RELIEF / shading.shape[1] * torch.fft.irfft2(torch.fft.rfft2(shading) * band, s=shading.shape)
