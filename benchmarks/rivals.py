@@ -5,6 +5,7 @@ Rendering-Aware Deep Network), at half its width and six levels of eight, for cr
 `training/train.py --network deep-materials`.
 """
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -74,14 +75,21 @@ class DeepMaterials(nn.Module):
         return {"albedo": torch.sigmoid(albedo) ** 2.2, "slope": slope, "roughness": torch.sigmoid(roughness)}
 
 
-def deep_materials(texture: np.ndarray, weights: Path) -> SVBRDF:
-    """The SVBRDF that it finds of a texture (H, W, 3) float32 linear, which wraps, with the weights of a file."""
-    tensors, _ = read_tensors(weights)
+@cache
+def load(path: Path) -> DeepMaterials:
+    """The network with the weights of a safetensors file; PaletteError where they are not this network's."""
+    tensors, _ = read_tensors(path)
     net = DeepMaterials().eval()
     try:
         net.load_state_dict({name: torch.from_numpy(x.astype(np.float32)) for name, x in tensors.items()})
     except RuntimeError as error:
-        raise PaletteError(f"'{weights}' does not hold the weights of {type(net).__name__}") from error
+        raise PaletteError(f"'{path}' does not hold the weights of {type(net).__name__}") from error
+    return net
+
+
+def deep_materials(texture: np.ndarray, weights: Path) -> SVBRDF:
+    """The SVBRDF that it finds of a texture (H, W, 3) float32 linear, which wraps, with the weights of a file."""
+    net = load(weights)
     encoded = srgb_from_linear(np.clip(texture, 0, 1)).astype(np.float32)
     h, w = encoded.shape[:2]
     rows, columns = (np.arange(-MARGIN, -(-n // STRIDE) * STRIDE + MARGIN) % n for n in (h, w))

@@ -52,7 +52,7 @@ class Settings:
     resolution is the side of the square maps in px; metres_per_tile the length that one repeat covers on an object,
     where a region's measure does not tell; rectify: "auto" brings a slanted region to the front, by its corners or by
     the plane that is found, "quad" by its corners only, "off" never; flatten takes slow changes of light and cast
-    shadows out of a region; white_balance "region" takes the region's mean for grey. "card"
+    shadows out of a region; white_balance "region" takes the region's mean for grey, "card"
     takes grey_card, the linear colour of the photo's grey card, for a reflectance of 18 %. scale is how much larger the
     texture is shown than the photo shows it; the tile's area shrinks by as much. keep_concepts: each material's concept
     is kept and written, to sample others from. full_maps: nothing is reduced. target_error:

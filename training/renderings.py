@@ -171,9 +171,9 @@ def lit(batch: dict[str, torch.Tensor], random: np.random.Generator) -> tuple[to
         falloff = distance**2 / to_lamp.square().sum(-1, keepdim=True)
         colour = last(torch.exp(0.08 * torch.randn(count, 3, 1, 1, generator=generator)))
         share = last(uniform(0.1, 1.2, 1) if lamp == 0 else uniform(0.1, 0.6, 1))
-        lit = brdf.shade(albedo, normal, roughness, _unit(to_lamp), view, metallic) * falloff
+        reflected = brdf.shade(albedo, normal, roughness, _unit(to_lamp), view, metallic) * falloff
         cosine = direction[..., 2:]
-        total = total + share * colour * lit / cosine
+        total = total + share * colour * reflected / cosine
         weight = weight + share
         across = direction[..., :2] * torch.tensor([1.0, -1.0])  # rows go down
         lamps = lamps + (share * across / cosine).movedim(-1, 1)
