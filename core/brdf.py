@@ -25,7 +25,8 @@ def shade(albedo, normal, roughness, light, view, metallic=0.0):
     half = half / half.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-6)
     nl = (normal * light).sum(-1, keepdim=True).clamp_min(0)
     nv = (normal * view).sum(-1, keepdim=True).clamp_min(1e-4)
-    nh = (normal * half).sum(-1, keepdim=True).clamp_min(0)
+    # rounded up above 1 it would divide by zero where a surface is a mirror
+    nh = (normal * half).sum(-1, keepdim=True).clamp(0, 1)
     vh = (view * half).sum(-1, keepdim=True).clamp_min(0)
     alpha2 = torch.as_tensor(roughness)[..., None].clamp_min(0.02) ** 4
     metallic = torch.as_tensor(metallic, dtype=albedo.dtype)[..., None]

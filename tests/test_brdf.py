@@ -74,6 +74,12 @@ def test_gradients_are_finite_at_grazing_angles_and_behind_the_light():
     assert torch.isfinite(normal.grad).all() and torch.isfinite(roughness.grad).all()
 
 
+def test_the_highlight_of_a_mirror_is_bright_not_infinite():
+    normal = random_unit(20_000, generator=torch.Generator().manual_seed(2)).float()
+    light = brdf.shade(torch.zeros(20_000, 3), normal, torch.zeros(20_000), normal, normal)
+    assert torch.isfinite(light).all() and light.min() > 1e3
+
+
 def test_a_lamp_far_away_is_a_sun():
     generator = torch.Generator().manual_seed(1)
     albedo, normal = torch.rand(2, 8, 8, 3, generator=generator), random_unit(2, 8, 8, generator=generator).float()

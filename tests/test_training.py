@@ -105,6 +105,26 @@ def test_the_opponent_learns_and_goes_on_where_it_stopped(learnt):
         assert torch.equal(p, first.learnt[name])
 
 
+def test_a_gain_beyond_all_measure_spoils_no_gradient():
+    pixels, gain = torch.full((1, 3, 8, 8), 0.5), torch.full((1, 3, 8, 8), 200.0, requires_grad=True)
+    found = train.answers({"gain": gain, "slope": torch.zeros(1, 2, 8, 8)}, pixels)
+    assert found["albedo"].max() == 1
+    found["albedo"].sum().backward()
+    assert torch.isfinite(gain.grad).all()
+
+
+def test_what_is_fitted_apart_outlives_a_pause(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "from_published", lambda state: state)
+    torch.save(train.SvbrdfNet().trunk.state_dict(), tmp_path / "trunk.pth")
+    first, again = (train.Run(tmp_path / "trunk.pth", seed) for seed in (0, 1))
+    first.start(ROOT / "models" / "svbrdf_net.safetensors")
+    first.save(tmp_path)
+    again.load(tmp_path)
+    for name, p in first.net.named_parameters():
+        assert torch.equal(dict(again.net.named_parameters())[name], p) or name.startswith("trunk."), name
+    assert again.net.mean_roughness.weight.abs().max() > 0
+
+
 def test_the_opponent_is_read_from_its_file(learnt, tmp_path):
     texture = np.ascontiguousarray(pebbles(96, 80), np.float32) ** 2
     found = rivals.deep_materials(texture, learnt[0] / "svbrdf_net.safetensors")

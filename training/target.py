@@ -1,9 +1,9 @@
 """Textures without labels for adapting the decomposer: what the pipeline makes of the regions of photos.
 
-    .venv/bin/python training/target.py PHOTO... -o FOLDER
+    .venv/bin/python training/target.py [--close] PHOTO... -o FOLDER
 
-Regions by `auto`, textures by the engine `patch`; one <photo>_<number>.png of SIZE px each. `training/train.py --target
-FOLDER` trains with them.
+Regions by `auto`, or all of each photo (`--close`: photos of one material); textures by the engine `patch`; one
+<photo>_<number>.png of SIZE px each. `training/train.py --target FOLDER` trains with them.
 """
 
 import argparse
@@ -34,15 +34,20 @@ def quiet(fraction: float, message: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path, nargs="+")
+    parser.add_argument("--close", action="store_true", help="each photo shows one material")
     parser.add_argument("-o", "--output", type=Path, required=True)
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)
     for path in options.photos:
         photo = read_photo(path)
-        for i, region in enumerate(segment(photo.pixels, regions=REGIONS)):
+        if options.close:
+            masks = [np.ones(photo.pixels.shape[:2], bool)]
+        else:
+            masks = [region.mask for region in segment(photo.pixels, regions=REGIONS)]
+        for i, mask in enumerate(masks):
             try:
-                exemplar = cut_exemplar(photo.pixels, region.mask)
+                exemplar = cut_exemplar(photo.pixels, mask)
                 encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1)).astype(np.float32)
                 texture = patch.sample(patch.learn(encoded, exemplar.mask, quiet), (SIZE, SIZE), i, quiet, "draft")
             except PaletteError as error:

@@ -44,6 +44,7 @@ AVERAGE = 0.998  # of the weights, per step
 EVERY = 250  # steps between checkpoints
 REAL = 0.6  # share of real materials beside procedural ones
 TARGET = 0.25  # share of textures without labels, where there are such
+MOST_GAIN = 5.0  # logarithm: where albedo is clipped nothing else holds it, and a critic drives it till exp overflows
 LABELLED = 2.5  # times the slopes that are found for them: squared error keeps those of real ones flatter than true
 FRESH, KEPT = 0.3, 128  # share of steps that see a new batch; batches kept for the others, which see them turned
 NEW = 4  # procedural materials that take the place of others whenever a batch of them is drawn
@@ -61,7 +62,10 @@ def encoded(linear: torch.Tensor) -> torch.Tensor:
 
 def answers(out: dict[str, torch.Tensor], pixels: torch.Tensor) -> dict[str, torch.Tensor]:
     out = {name: x.float() for name, x in out.items()}
-    albedo = out["albedo"] if "albedo" in out else linear(pixels).clamp_min(1e-3) * torch.exp(out["gain"])
+    if "albedo" in out:
+        albedo = out["albedo"]
+    else:
+        albedo = linear(pixels).clamp_min(1e-3) * torch.exp(out["gain"].clamp(-MOST_GAIN, MOST_GAIN))
     return out | {"albedo": albedo.clamp(0, 1), "normal": normal_of(out["slope"])}
 
 
@@ -116,8 +120,15 @@ def _rendering_loss(found: dict, truth: torch.Tensor, batch: dict, generator: to
     return ((pictures[0] - pictures[1]).abs() * last(batch["known"])).mean()
 
 
-WEIGHTS = {"albedo": 10.0, "linear": 40.0, "normal": 40.0, "rendering": 0.5, "roughness": 10.0, "lamp": 1.0}
-ADVERSARY = 0.05  # weight of fooling the critic
+WEIGHTS = {
+    "albedo": 10.0,
+    "linear": 40.0,
+    "normal": 40.0,
+    "rendering": 0.5,
+    "roughness": 10.0,
+    "lamp": 1.0,
+    "adversary": 0.05,
+}
 
 
 class Critic(nn.Module):
@@ -213,7 +224,7 @@ class Run:
 
     def save(self, folder: Path) -> None:
         state = {
-            "net": {name: p.detach() for name, p in self.learnt.items()},
+            "net": {name: p.detach() for name, p in self.net.named_parameters() if not name.startswith("trunk.")},
             "average": self.average,
             "optimiser": self.optimiser.state_dict(),
             "step": self.step,
@@ -227,9 +238,7 @@ class Run:
 
     def load(self, folder: Path) -> None:
         state = torch.load(folder / "checkpoint.pt", weights_only=True)
-        with torch.no_grad():
-            for name, value in state["net"].items():
-                self.learnt[name].copy_(value)
+        self.net.load_state_dict(state["net"], strict=False)  # but for the trunk's
         self.average = state["average"]
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.seconds = state["step"], state["seconds"]
@@ -325,7 +334,11 @@ def main() -> None:
             # the texture itself, not lit again: its own light is in it
             unlabelled = run.find(encoded(target.batch(BATCH // 2)["albedo"]))
             truth = {"albedo": batch["albedo"], "normal": normal_of(batch["slope"])}
-            loss = loss + ADVERSARY * criticise(run.critic, critics, truth, found, unlabelled)
+            parts["adversary"] = criticise(run.critic, critics, truth, found, unlabelled)
+            loss = loss + WEIGHTS["adversary"] * parts["adversary"]
+        if not torch.isfinite(loss):
+            values = ", ".join(f"{name} {part:.3g}" for name, part in parts.items())
+            raise SystemExit(f"the loss is not finite at step {run.step}: {values}; go on from the last checkpoint")
         run.optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(run.learnt.values(), 1.0)
