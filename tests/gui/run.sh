@@ -1,11 +1,11 @@
 #!/bin/bash
 # The extension in a real Blender window: the example photo, real clicks, what the data holds afterwards, screenshots.
 #
-#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [artist|tools|library|interrupt|redraws]
+#   BLENDER_GUI=.../blender_gui.sh tests/gui/run.sh EXTENSION.zip OUT.png [artist|tools|card|library|interrupt|redraws]
 #
 # NAME.sh here drives the window from outside, NAME.py (or window.py) runs in Blender. artist, the default, goes from the
-# photo to assigned materials, tools tries what it leaves out, library the preferences and what leaves the file; they
-# also write OUT-STEP.png after their steps.
+# photo to assigned materials, tools tries what it leaves out, card the eyedropper, library the preferences and what
+# leaves the file; they also write OUT-STEP.png after their steps.
 # Exit code 0 when all went as expected. PALETTE_EXAMPLE: another folder with photo.jpg and masks/.
 # PALETTE_PATIENCE: a factor on all waits, for a busy machine (1).
 set -euo pipefail

@@ -1,4 +1,4 @@
-"""Runs inside Blender's window for the stories artist, tools and library: reports what the clicks outside have made.
+"""Runs inside Blender's window for the stories without a file of their own: reports what the clicks outside have made.
 
 Environment: PALETTE_PHOTO, PALETTE_STATE (a JSON file, rewritten twice a second: what the data holds). A file
 PALETTE_STATE.do holds the name of a function below to be called.
@@ -14,6 +14,7 @@ import numpy as np
 
 STATE = os.environ["PALETTE_STATE"]
 BLEND = STATE + ".blend"
+CARD = 450, 400  # thousandths of the photo where the eyedropper is put
 done = []  # functions that were called, by the order
 handle = []  # thousandths of the photo
 
@@ -113,6 +114,23 @@ def clear():
     region = palette().regions[palette().active_region]
     region.has_corners = region.has_measure = False
     bpy.ops.ed.undo_push(message="Clear")
+
+
+def card():
+    """White balance by a grey card, which the eyedropper takes from the photo."""
+    palette().white_balance = "card"
+    blender_gui.find_area("IMAGE_EDITOR").tag_redraw()
+    bpy.ops.ed.undo_push(message="Card")
+
+
+def linear_at(photo, across, down):
+    """Mean linear colour of the photo's pixels around a place in thousandths."""
+    width, height = photo.size
+    pixels = np.empty(width * height * 4, np.float32)
+    photo.pixels.foreach_get(pixels)
+    x, y = across * width // 1000, (1000 - down) * height // 1000
+    around = pixels.reshape(height, width, 4)[y - 2 : y + 3, x - 2 : x + 3, :3].mean((0, 1))
+    return [float(((v + 0.055) / 1.055) ** 2.4) for v in around]
 
 
 def larger():
@@ -338,6 +356,8 @@ def report():
         "resolution": settings.resolution,
         "widths": sorted({image.size[0] for image in pictures(active)}) if active else None,
         "brightness": active.material_palette.brightness if active else None,
+        "card": list(settings.grey_card),
+        "at_card": linear_at(settings.photo, *CARD) if settings.photo else None,
         "seen": brightness_of_preview(active) if active and active.preview else None,
         "pastes": paste_is_offered(),
         "browser": rectangle("FILE_BROWSER", "WINDOW"),
