@@ -8,7 +8,7 @@
 DATA is a folder with pbr/<collection>/<material>/{basecolor,normal,roughness}.jpg. Held out are the collection
 `polyhaven` and every fourth material of the others. A row is a name of ROWS, or name=FILE with other weights. Writes
 svbrdf.csv (a row per decomposer, material and seed), svbrdf.json (machine, command, summary), svbrdf.png (chart) and
-svbrdf.jpg (sheet).
+svbrdf.jpg (sheet). `--keep` goes on: rows that svbrdf.csv has already are not run again.
 Matplotlib makes the chart, `flip-evaluator` the column FLIP; without them both are left out, and it says so.
 """
 
@@ -363,6 +363,21 @@ MAPS = ("A_mse", "N_mse", "R_mse", "A_ssim", "N_ssim", "R_ssim")
 OTHERS = ("delta_e", "angle", "relit_psnr", "relit_flip", "N_lpips", "R_lpips")
 
 
+def read_results(folder: Path, conditions: dict) -> list[dict]:
+    """The rows of a folder's svbrdf.csv; SystemExit where it is missing or its JSON says other conditions."""
+    try:
+        about = json.loads((folder / "svbrdf.json").read_text())
+        with (folder / "svbrdf.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise SystemExit(f"--keep: cannot read '{error.filename}'; leave --keep out to measure all rows") from error
+    for name, value in conditions.items():
+        if about[name] != value:
+            raise SystemExit(f"--keep: the rows in '{folder}' are of other {name}; leave --keep out")
+    numbers = {key: lambda x: float(x) if x else None for key in (*MAPS, *OTHERS)} | {"seed": int}
+    return [{key: numbers.get(key, str)(x) for key, x in row.items()} for row in rows]
+
+
 def summarise(results: list[dict], rows: list[str], where: Callable[[str], bool]) -> dict:
     """Per row: each material's median over the seeds, of which the mean (the paper's form) and quartiles."""
     summary = {}
@@ -488,6 +503,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--collections", nargs="+", help="held-out collections that count; default: all")
     parser.add_argument("--quick", action="store_true", help="polyhaven if there, 256 px, one seed, no cost")
     parser.add_argument("--size", type=int, help=f"px of what is decomposed ({SIZE}; with --quick 256)")
+    parser.add_argument("--keep", action="store_true", help="do not run again the rows that svbrdf.csv already has")
     parser.add_argument("--no-cost", action="store_true", help="without seconds and memory")
     parser.add_argument("--cost", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -504,12 +520,15 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     start = time.time()
     prior = fit_prior(training, size)
-    rows = {row: decomposer(row, prior) for row in options.rows}
+    conditions = {"size": size, "seeds": list(seeds), "materials": [f"{f.parent.name}/{f.name}" for f in held_out]}
+    results = read_results(options.output, conditions) if options.keep else []
+    results = [r for r in results if r["row"] in map(label, options.rows)]
+    kept = list(dict.fromkeys(r["row"] for r in results))
+    rows = {row: decomposer(row, prior) for row in options.rows if label(row) not in kept}
     if find_spec("flip_evaluator") is None:
         print("flip-evaluator is not installed: without the column FLIP", flush=True)
     print(f"{len(held_out)} held-out materials, prior of {len(training)}: {prior}", flush=True)
 
-    results = []
     for folder in held_out:
         material = read_material(folder, size)
         small = smaller(material)
@@ -531,10 +550,9 @@ def main(arguments: list[str] | None = None) -> int:
         writer.writerows(results)
     about = {
         "rows": [row.partition("=")[0] for row in options.rows],
+        "kept": kept,
         "against": options.against,
-        "size": size,
-        "seeds": seeds,
-        "materials": [f"{f.parent.name}/{f.name}" for f in held_out],
+        **conditions,
         "command": command(),
         "commit": commit(),
         "machine": machine(),
@@ -547,7 +565,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"\n{name}\n{table(summary, options.against, cost)}")
     chart(summaries["all"], options.output / "svbrdf")
     shown = [f for f in held_out if f.parent.name in ("polyhaven", "ambientcg")][:: max(1, len(held_out) // 6)][:6]
-    last = rows[options.rows[-1]]
+    last = decomposer(options.rows[-1], prior)
     sheet([read_material(f, size) for f in shown or held_out[:4]], last, options.output / "svbrdf.jpg")
     return 0
 

@@ -87,3 +87,14 @@ def test_held_out_materials_are_all_of_polyhaven_and_every_fourth(tmp_path):
     assert len(training) == 6
     with pytest.raises(SystemExit, match="no material"):
         svbrdf.split(tmp_path / "pbr")
+
+
+def test_rows_that_were_measured_are_kept_under_the_same_conditions_only(tmp_path):
+    (tmp_path / "svbrdf.json").write_text('{"size": 256}')
+    (tmp_path / "svbrdf.csv").write_text("row,material,seed,A_mse,N_mse\nunet,a/b,101,0.5,\n")
+    rows = svbrdf.read_results(tmp_path, {"size": 256})
+    assert rows == [{"row": "unet", "material": "a/b", "seed": 101, "A_mse": 0.5, "N_mse": None}]
+    with pytest.raises(SystemExit, match="other size"):
+        svbrdf.read_results(tmp_path, {"size": 512})
+    with pytest.raises(SystemExit, match="leave --keep out"):
+        svbrdf.read_results(tmp_path / "nowhere", {"size": 256})
