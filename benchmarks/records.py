@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import resource
+import shlex
 import subprocess
 import sys
 import time
@@ -45,8 +46,11 @@ def commit() -> str:
 
 def command() -> str:
     """What was typed, without the folders of this machine."""
-    words = [Path(sys.argv[0]).name, *sys.argv[1:]]
-    return " ".join(Path(word).name if os.path.isabs(word) else word for word in words)
+    words = [Path(sys.argv[0]).name]
+    for word in sys.argv[1:]:
+        label, equals, path = word.rpartition("=")  # row=FILE too
+        words.append(label + equals + Path(path).name if os.path.isabs(path) else word)
+    return shlex.join(words)
 
 
 class Parts:

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from material_palette.benchmarks import baselines, measures
+from material_palette.benchmarks import baselines, measures, records
 from material_palette.core.torus import WRAP_GATE, wrap_ratio
 from textures import pebbles, tileable_noise
 
@@ -126,3 +126,10 @@ def test_exact_search_is_the_normalised_nearest():
     d = torch.cdist(queries.double(), keys.double()).square()
     expected = (d / (baselines.ALPHA + d.min(0).values)).argmin(1)
     assert (baselines._nearest_normalised(keys)(queries) == expected).float().mean() > 0.99
+
+
+def test_the_command_that_is_kept_names_no_folder_of_the_machine(monkeypatch):
+    monkeypatch.setattr(
+        "sys.argv", ["/here/svbrdf.py", "--data", "/there/data", "--rows", "a:b c=/there/x.bin", "unet"]
+    )
+    assert records.command() == "svbrdf.py --data data --rows 'a:b c=x.bin' unet"
