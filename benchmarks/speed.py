@@ -177,14 +177,14 @@ def chart_points(points: dict[str, tuple[float, float]], others: dict[str, float
     front = measures.pareto(points)
     if front:
         axes.step(*zip(*(points[n] for n in front), strict=True), where="post", color="0.7", lw=1, zorder=1)
-    for i, (name, (x, y)) in enumerate(sorted(points.items())):
+    for name, (x, y) in points.items():
         axes.plot(x, y, "o", color=charts.OURS if "unet" in name else charts.COLOURS[2], zorder=3)
-        where = (6, 5 if i % 2 else -11)
-        axes.annotate(name.removeprefix("ours, "), (x, y), where, textcoords="offset points", fontsize=8)
-    for name, y in others.items():
+        where = (6, 5 if "unet" in name else -11)
+        axes.annotate(name.removeprefix("ours, "), (x, y), where, textcoords="offset points", fontsize=7)
+    for i, (name, y) in enumerate(sorted(others.items(), key=lambda item: item[1])):
         axes.axhline(y, color=charts.OTHER, lw=0.8, ls="--")
         where = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}
-        axes.annotate(name, (0.99, y), (0, 2), fontsize=8, color=charts.OTHER, **where)
+        axes.annotate(name, (0.99, y), (0, 2 if i % 2 else -9), fontsize=8, color=charts.OTHER, **where)
     axes.set_xlabel("CPU seconds per material at 1024 px")
     axes.set_ylabel("end-to-end error: mean ST-LPIPS of A, N, R")
     axes.margins(x=0.15, y=0.15)
@@ -211,6 +211,9 @@ def chart_growth(growth: dict, path: Path) -> None:
         lower.set_ylim(bottom=0)
         lower.set_ylabel("peak MB")
         lower.set_xlabel(GROWTH[what][2])
+        for axis in (upper, lower):
+            axis.set_xticks(values, [f"{v:g}" for v in values])
+            axis.set_xticks([], minor=True)
     charts.save(figure, path)
 
 
