@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Speed against accuracy of the whole product, and how the cost grows.
 
-    python3 dev.py bench speed --data DATA -o DIR [--errors DIR/endtoend.csv] [--largest 8192]
+    .venv/bin/python benchmarks/speed.py -o DIR/speed [--errors DIR/endtoend/endtoend.csv] [--largest 8192]
     python3 dev.py bench speed --quick
 
 Points are preset x decomposer: CPU and wall seconds per material at 1024 px (a bundled region), against the
