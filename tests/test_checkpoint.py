@@ -107,13 +107,18 @@ def test_a_single_file_is_the_same_model_as_its_folder(folder, tmp_path, tiny_fa
     assert checkpoint.family_of(path) == ("sd1", "epsilon")
     single = Engine(DiffusionSettings(model=str(path))).model(quiet)
     x, t = torch.randn(1, 4, 8, 8, generator=torch.Generator().manual_seed(0)), torch.tensor(300)
+
+    def same(first, second):
+        # some processors round otherwise where tensors lie otherwise in memory
+        return torch.allclose(first, second, rtol=1e-4, atol=1e-5)
+
     with torch.no_grad():
         text = whole.encode(["some stone"])
-        assert torch.equal(single.encode(["some stone"])[0], text[0])
-        assert torch.equal(single.predict(x, t, text), whole.predict(x, t, text))
-        assert torch.equal(single.vae.decode(x).sample, whole.vae.decode(x).sample)
+        assert same(single.encode(["some stone"])[0], text[0])
+        assert same(single.predict(x, t, text), whole.predict(x, t, text))
+        assert same(single.vae.decode(x).sample, whole.vae.decode(x).sample)
         picture = torch.rand(1, 3, 32, 32)
-        assert torch.equal(single.vae.encode(picture).latent_dist.mean, whole.vae.encode(picture).latent_dist.mean)
+        assert same(single.vae.encode(picture).latent_dist.mean, whole.vae.encode(picture).latent_dist.mean)
 
 
 def names(*more):
