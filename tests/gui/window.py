@@ -61,7 +61,8 @@ def keep_two():
     by_area = sorted(settings.regions, key=share)
     for region in settings.regions:
         region.enabled = region.name in {region.name for region in by_area[:2]}
-    settings.quality, settings.resolution = "balanced", 256
+    # long enough on a fast machine, too, for Esc to come before the second is done
+    settings.quality, settings.resolution = "best", 1024
     bpy.ops.ed.undo_push(message="Choose")
 
 
