@@ -513,7 +513,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, help="folder with INDEX.csv and pbr/; without: procedural materials")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "dist" / "benchmarks" / "endtoend")
     parser.add_argument("--scenes", type=int, default=6, help="how many (%(default)s use every material once)")
-    parser.add_argument("--presets", type=int, default=6, help="scenes with all presets, not `balanced` alone (6)")
+    parser.add_argument(
+        "--presets", type=int, default=6, help="scenes with all presets, not `balanced` alone (%(default)s)"
+    )
     parser.add_argument("--clip", type=Path, metavar="DIR", help="CLIP's weights, for its classes of what is extracted")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no scene after so long; go on later")
     parser.add_argument("--quick", action="store_true", help="one small scene, one preset")

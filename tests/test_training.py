@@ -123,6 +123,8 @@ def test_what_is_fitted_apart_outlives_a_pause(tmp_path, monkeypatch):
     for name, p in first.net.named_parameters():
         assert torch.equal(dict(again.net.named_parameters())[name], p) or name.startswith("trunk."), name
     assert again.net.mean_roughness.weight.abs().max() > 0
+    with pytest.raises(RuntimeError, match="DeepMaterials"):
+        train.Run(Path(), 0, "deep-materials").load(tmp_path)
 
 
 def test_the_opponent_is_read_from_its_file(learnt, tmp_path):

@@ -238,7 +238,7 @@ class Run:
 
     def load(self, folder: Path) -> None:
         state = torch.load(folder / "checkpoint.pt", weights_only=True)
-        self.net.load_state_dict(state["net"], strict=False)  # but for the trunk's
+        self.net.load_state_dict(self.net.state_dict() | state["net"])  # the trunk is not in it
         self.average = state["average"]
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.seconds = state["step"], state["seconds"]

@@ -12,7 +12,7 @@ dropper() {
   xdo mousemove $((x + w * 2 / 3)) $((y - 23)) sleep 1
   key e
   sleep 1
-  xdo mousemove $(at 450 400) sleep 1 click 1
+  xdo mousemove $(at $(state card_place)) sleep 1 click 1
 }
 again_until "max(abs(a - b) for a, b in zip(card, at_card)) < 0.02" dropper
 picture card

@@ -4,6 +4,7 @@ Environment: PALETTE_PHOTO, PALETTE_STATE (a JSON file, rewritten twice a second
 PALETTE_STATE.do holds the name of a function below to be called.
 """
 
+import importlib
 import json
 import os
 import sys
@@ -17,6 +18,7 @@ BLEND = STATE + ".blend"
 CARD = 450, 400  # thousandths of the photo where the eyedropper is put
 done = []  # functions that were called, by the order
 handle = []  # thousandths of the photo
+at_card = []  # linear colour of the photo where the eyedropper is put
 
 
 def editor():
@@ -122,16 +124,14 @@ def card():
     palette().white_balance = "card"
     blender_gui.find_area("IMAGE_EDITOR").tag_redraw()
     bpy.ops.ed.undo_push(message="Card")
-
-
-def linear_at(photo, across, down):
-    """Mean linear colour of the photo's pixels around a place in thousandths."""
+    photo = palette().photo
     width, height = photo.size
     pixels = np.empty(width * height * 4, np.float32)
     photo.pixels.foreach_get(pixels)
-    x, y = across * width // 1000, (1000 - down) * height // 1000
+    x, y = CARD[0] * width // 1000, (1000 - CARD[1]) * height // 1000
     around = pixels.reshape(height, width, 4)[y - 2 : y + 3, x - 2 : x + 3, :3].mean((0, 1))
-    return [float(((v + 0.055) / 1.055) ** 2.4) for v in around]
+    image = importlib.import_module("bl_ext.user_default.material_palette.core.image")
+    at_card[:] = image.linear_from_srgb(around).tolist()
 
 
 def larger():
@@ -358,7 +358,8 @@ def report():
         "widths": sorted({image.size[0] for image in pictures(active)}) if active else None,
         "brightness": active.material_palette.brightness if active else None,
         "card": list(settings.grey_card),
-        "at_card": linear_at(settings.photo, *CARD) if settings.photo else None,
+        "at_card": at_card,
+        "card_place": " ".join(map(str, CARD)),
         "seen": brightness_of_preview(active) if active and active.preview else None,
         "pastes": paste_is_offered(),
         "browser": rectangle("FILE_BROWSER", "WINDOW"),
