@@ -136,6 +136,15 @@ def test_a_pool_of_light_is_taken_out_and_colour_that_wanders_is_kept():
     assert np.ptp(found, axis=-1).max() < 0.02
 
 
+def test_light_that_no_polynomial_follows_is_taken_out_where_no_texture_is_as_uneven():
+    noise = np.random.default_rng(0).standard_normal((SIDE, SIDE)).astype(np.float32)
+    light = cv2.GaussianBlur(noise, (0, 0), SIDE / 8)[..., None]
+    light = 0.4 * (light - light.mean()) / light.std()
+    found = np.log(find_light(0.5 * texture() ** 0.3 * np.exp(light), everywhere()).shading)
+    assert (found - light).std() < 0.7 * light.std()  # the polynomial leaves 0.82
+    assert np.ptp(found, axis=-1).max() < 0.01
+
+
 def test_shading_times_exemplar_is_the_photo():
     photo = photographed(texture() * under(half()))
     exemplar = cut_exemplar(photo, everywhere())

@@ -145,6 +145,19 @@ def test_regions_of_any_shape(kind):
     assert texture.pixels.std() > 0.5 * exemplar[mask > 0].std()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_no_line_stands_out_in_what_is_made_of_thin_strips(seed):
+    v, u = np.mgrid[:150, :150]
+    grain = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((150, 150)), (0, 0), 1.0)
+    tone = np.where(u > 110, 0.75, 0.45 + 0.1 * np.sin(u / 9)) + 0.06 * grain
+    pixels = (tone[..., None] * [1, 0.5, 0.4]).clip(0, 1).astype(np.float32)
+    texture = synthesise(pixels, (u + v) % 40 < 20, (320, 320), seed)
+    small = cv2.resize(texture.pixels, (160, 160), interpolation=cv2.INTER_AREA)
+    for axis in (0, 1):
+        steps = np.abs(small - np.roll(small, 1, axis)).mean((1 - axis, 2))
+        assert steps.max() < 2.3 * np.median(steps)  # a quilt's end and beginning: 3 to 8 times
+
+
 def test_a_region_without_a_patch_is_refused():
     mask = np.zeros((100, 100), bool)
     mask[50:54] = True

@@ -389,6 +389,8 @@ def _quilt(level: Level, size: tuple[int, int], phases: _Phases, generator: torc
     h, w = size
     stride = level.shape[1]
     side, anchors = _block(level, min(h, w))
+    if side == PATCH and not phases.axes:
+        return _scattered(level, size, generator)
     if len(anchors) > ANCHORS:
         anchors = anchors[torch.randperm(len(anchors), generator=generator)[:ANCHORS]]
     local = torch.arange(side)
@@ -428,6 +430,17 @@ def _quilt(level: Level, size: tuple[int, int], phases: _Phases, generator: torc
         used += torch.bincount(chosen.flatten(), minlength=len(used))
         report(0.0)
     return _to_sources(level, coordinates.reshape(h, w))
+
+
+def _scattered(level: Level, size: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
+    """Coordinates (H, W) of patches of the exemplar drawn at random, side by side: where a region is too thin for blocks
+    with a structure, a chain of patches that agree drifts along the rows, and its end does not meet its beginning."""
+    h, w = size
+    sources = level.valid.nonzero()[:, 0]
+    drawn = sources[torch.randint(len(sources), (-(-h // PATCH), -(-w // PATCH)), generator=generator)]
+    drawn = drawn.repeat_interleave(PATCH, 0).repeat_interleave(PATCH, 1)[:h, :w]
+    y, x = (torch.arange(side) % PATCH - RADIUS for side in size)
+    return _to_sources(level, drawn + y[:, None] * level.shape[1] + x)
 
 
 def _block(level: Level, limit: int) -> tuple[int, torch.Tensor]:
