@@ -6,7 +6,8 @@ Claim: with x the logarithm of the pixels, light adds to the texture, and two ki
 
 slow is a polynomial of up to four degrees, each as far as it exceeds what the texture's own unevenness makes of one,
 which the scatter of the means of blocks about the polynomial tells. Light is nearly grey: a change of colour has to be
-clearer than one of brightness before it is taken for light. A cast shadow is a step s per channel under a matte m. Any
+clearer than one of brightness before it is taken for light. What no polynomial follows is taken out as far as it is
+more than any texture has of slow changes. A cast shadow is a step s per channel under a matte m. Any
 texture has some best division into a light and a dark class; it is a shadow when the step is the same all along their
 border (a stone or a stain ends differently everywhere) and turns no colour but a little towards blue, since what lights
 a shadow is the sky. The matte's slope is the border's mean profile; where the balance is unsure, it is said.
@@ -46,8 +47,8 @@ BLUISH = 0.05  # change of log R/B per log luminance
 WARMEST = -0.12  # the same; a darker part that is warmer is a stain
 GREENEST = 0.12
 UNSURE = 1.5  # cells beside a border that may lie on its other side
-# of the variance: what is left of slow changes, seen through a window of WIDE of the region's side. The most uneven of 89
-# photographed textures has 0.074; what exceeds it is light, such as that on a box's two sides
+# of the variance: what is left of slow changes, seen through a window of WIDE of the region's side. The most uneven of
+# 89 photographed textures has 0.074; what exceeds it is light, such as that on a box's two sides
 WIDE = 1 / 8
 MOST_LEFT = 0.075
 
@@ -175,7 +176,7 @@ def _slow(x: np.ndarray, inside: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _left(rest: np.ndarray, inside: np.ndarray, variance: float) -> np.ndarray:
-    """Slow changes (h, w, 3), of mean 0 inside, that `rest` (h, w, 3) has beyond what a texture of this variance has."""
+    """Slow changes (h, w, 3), of mean 0 inside, that `rest` (h, w, 3) has beyond any texture of that variance."""
     wide = masked_blur(rest, inside, WIDE * float(np.sqrt(inside.sum())))
     wide = np.where(inside[..., None], wide - wide[inside].mean(0), 0)
     share = float(wide[inside].var(0).sum()) / max(variance, 1e-9)

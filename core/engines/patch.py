@@ -433,8 +433,8 @@ def _quilt(level: Level, size: tuple[int, int], phases: _Phases, generator: torc
 
 
 def _scattered(level: Level, size: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
-    """Coordinates (H, W) of patches of the exemplar drawn at random, side by side: where a region is too thin for blocks
-    with a structure, a chain of patches that agree drifts along the rows, and its end does not meet its beginning."""
+    """Coordinates (H, W) of patches of the exemplar drawn at random, side by side: where a region is too thin for
+    blocks with a structure, a chain of patches that agree drifts, and its end does not meet its beginning."""
     h, w = size
     sources = level.valid.nonzero()[:, 0]
     drawn = sources[torch.randint(len(sources), (-(-h // PATCH), -(-w // PATCH)), generator=generator)]
