@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,7 @@ from textures import pebbles, tileable_noise
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "training"))
+import materials  # noqa: E402
 import renderings  # noqa: E402
 import train  # noqa: E402
 
@@ -135,3 +137,19 @@ def test_the_opponent_is_read_from_its_file(learnt, tmp_path):
     assert np.allclose(np.linalg.norm(found.normal, axis=-1), 1, atol=1e-5)
     with pytest.raises(PaletteError, match="DeepMaterials"):
         rivals.deep_materials(texture, ROOT / "models" / "svbrdf_net.safetensors")
+
+
+def test_sets_are_split_and_collections_chosen_by_name(tmp_path):
+    for name in ("first/a", "first/b", "first/c", "first/d", "polyhaven/a", "second/a"):
+        (tmp_path / "pbr" / name).mkdir(parents=True)
+        for kind in ("basecolor", "normal", "roughness"):
+            cv2.imwrite(str(tmp_path / "pbr" / name / f"{kind}.png"), np.full((8, 8, 3), 128, np.uint8))
+
+    def names(sets):
+        return [s.name for s in sets]
+
+    training, held_out = map(names, materials.read_sets(tmp_path))
+    assert training == ["first/a", "first/b", "first/c", "second/a"] and held_out == ["first/d", "polyhaven/a"]
+    assert tuple(map(names, materials.read_sets(tmp_path, ["second"]))) == (["second/a"], [])
+    with pytest.raises(FileNotFoundError, match="'third'.*first, polyhaven, second"):
+        materials.read_sets(tmp_path, ["third"])

