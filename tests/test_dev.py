@@ -85,11 +85,18 @@ def test_bench_runs_the_suites_named_and_says_when_one_failed(monkeypatch, tmp_p
     assert "speed: 0 s, FAILED" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("wrong", [["nonsense", "--quick"], ["speed"]])
+@pytest.mark.parametrize("wrong", [["nonsense", "--quick"], ["speed", "texture"], []])
 def test_bench_refuses_an_unknown_suite_and_a_run_without_data(wrong, monkeypatch):
     monkeypatch.setattr(dev.subprocess, "call", pytest.fail)
     with pytest.raises(SystemExit):
         dev.bench(wrong)
+
+
+def test_bench_asks_for_no_data_where_none_is_needed(monkeypatch, tmp_path):
+    ran = []
+    monkeypatch.setattr(dev.subprocess, "call", lambda command, **more: ran.append(command) or 0)
+    assert dev.bench(["speed", "-o", str(tmp_path)]) == 0
+    assert ran[0][2:] == ["-o", str(tmp_path / "speed")]
 
 
 @pytest.mark.parametrize("change", ["requirements", "python"])

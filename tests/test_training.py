@@ -107,6 +107,19 @@ def test_the_opponent_learns_and_goes_on_where_it_stopped(learnt):
         assert torch.equal(p, first.learnt[name])
 
 
+def test_the_critic_goes_on_where_it_stopped(tmp_path):
+    runs = [train.Run(Path(), seed, "deep-materials", adversary=True) for seed in (0, 1)]
+    batch = bumps(2)
+    maps = {"albedo": batch["albedo"], "normal": renderings.normal_of(batch["slope"])}
+    train.criticise(runs[0].critic, runs[0].critics, maps, maps, maps)
+    runs[0].save(tmp_path)
+    runs[1].load(tmp_path)
+    with torch.no_grad():
+        assert torch.equal(*(run.critic(maps) for run in runs))
+    moments = [run.critics.state_dict()["state"][0]["exp_avg"] for run in runs]
+    assert torch.equal(*moments) and moments[0].abs().max() > 0
+
+
 def test_a_gain_beyond_all_measure_spoils_no_gradient():
     pixels, gain = torch.full((1, 3, 8, 8), 0.5), torch.full((1, 3, 8, 8), 200.0, requires_grad=True)
     found = train.answers({"gain": gain, "slope": torch.zeros(1, 2, 8, 8)}, pixels)

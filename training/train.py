@@ -205,6 +205,7 @@ class Run:
             self.net = rivals.DeepMaterials()
         self.net = self.net.to(memory_format=torch.channels_last)
         self.critic = Critic() if adversary else None
+        self.critics = torch.optim.Adam(self.critic.parameters(), lr=2e-4, betas=(0.5, 0.99)) if adversary else None
         self.learnt = {name: p for name, p in self.net.named_parameters() if p.requires_grad}
         self.average = {name: p.detach().clone() for name, p in self.learnt.items()}
         self.optimiser = torch.optim.AdamW(self.learnt.values(), lr=RATE, weight_decay=1e-2)
@@ -230,6 +231,8 @@ class Run:
             "step": self.step,
             "seconds": self.seconds,
         }
+        if self.critic:
+            state["critic"] = self.critic.state_dict(), self.critics.state_dict()
         torch.save(state, folder / "checkpoint.part")
         (folder / "checkpoint.part").replace(folder / "checkpoint.pt")
         tensors = self.net.state_dict() | self.average
@@ -242,6 +245,9 @@ class Run:
         self.average = state["average"]
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.seconds = state["step"], state["seconds"]
+        if self.critic and "critic" in state:
+            for part, kept in zip((self.critic, self.critics), state["critic"], strict=True):
+                part.load_state_dict(kept)
 
 
 @torch.no_grad()
@@ -289,7 +295,6 @@ def main() -> None:
     validation = training[::WATCHED]
     training = [s for i, s in enumerate(training) if i % WATCHED]
     run = Run(options.trunk, options.seed, options.network, options.adversary)
-    critics = torch.optim.Adam(run.critic.parameters(), lr=2e-4, betas=(0.5, 0.99)) if run.critic else None
     if (options.output / "checkpoint.pt").exists():
         run.load(options.output)
         print(f"going on from step {run.step}", flush=True)
@@ -335,7 +340,7 @@ def main() -> None:
             # the texture itself, not lit again: its own light is in it
             unlabelled = run.find(encoded(target.batch(BATCH // 2)["albedo"]))
             truth = {"albedo": batch["albedo"], "normal": normal_of(batch["slope"])}
-            parts["adversary"] = criticise(run.critic, critics, truth, found, unlabelled)
+            parts["adversary"] = criticise(run.critic, run.critics, truth, found, unlabelled)
             loss = loss + WEIGHTS["adversary"] * parts["adversary"]
         if not torch.isfinite(loss):
             values = ", ".join(f"{name} {part:.3g}" for name, part in parts.items())
