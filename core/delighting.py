@@ -51,6 +51,7 @@ UNSURE = 1.5  # cells beside a border that may lie on its other side
 # 89 photographed textures has 0.074; what exceeds it is light, such as that on a box's two sides
 WIDE = 1 / 8
 MOST_LEFT = 0.075
+LEAST_WIDE = 84  # px: side of the square with the area of a region that shows enough of its texture to tell
 
 
 @dataclass
@@ -94,8 +95,9 @@ def find_light(
         unsure = mask & ((np.abs(distance) < UNSURE) | (cv2.resize(unbalanced, (w, h)) > 0))
         shaded = float((distance[mask] < 0).mean())
     texture = np.log(np.maximum(pixels[mask], DARKEST)) - (whole + cast_there)[mask]
-    left = _left(grid - cast - slow, inside, float(texture.var(0).sum()))
-    whole += cv2.resize(left, (w, h), interpolation=cv2.INTER_LINEAR)
+    if np.sqrt(inside.sum()) * scale > LEAST_WIDE:
+        left = _left(grid - cast - slow, inside, float(texture.var(0).sum()))
+        whole += cv2.resize(left, (w, h), interpolation=cv2.INTER_LINEAR)
     return Light(np.exp(whole + cast_there), np.exp(cast_there), unsure, shaded)
 
 
