@@ -525,9 +525,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.presets = 0 if quick else options.presets
     options.size, options.samples = ((400, 300), 8) if quick else ((scenes.WIDTH, scenes.HEIGHT), scenes.SAMPLES)
     options.auto, options.resolution = not quick, RESOLUTION
-    parts = records.Parts(
-        options.output.parent / "parts" / ("endtoend-quick" if quick else "endtoend"), options.minutes
-    )
+    parts = records.Parts(options.output, quick, options.minutes)
     keep = parts.folder / "pictures"
     results = []
     for number in range(1 if quick else options.scenes):

@@ -289,8 +289,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     options.size, options.grid = ((480, 270), 4) if options.quick else (SIZE, GRID)
     options.visible = (reduction.VISIBLE,) if options.quick else VISIBLE
-    name = "needs-quick" if options.quick else "needs"
-    parts = records.Parts(options.output.parent / "parts" / name, options.minutes)
+    parts = records.Parts(options.output, options.quick, options.minutes)
     work = parts.folder / "work"
     kinds = list(scenes.KINDS)[:1] if options.quick else list(scenes.KINDS)
     rows = []

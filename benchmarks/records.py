@@ -54,11 +54,13 @@ def command() -> str:
 
 
 class Parts:
-    """Finished pieces of a run by name, one JSON each, so that a stopped run goes on; `minutes` ends it early."""
+    """Finished pieces of the run that writes `output`, by name, one JSON each, so that a stopped run goes on; `minutes`
+    ends it early. They lie in `parts` beside the output, in a folder of its name."""
 
-    def __init__(self, folder: Path, minutes: float = float("inf")):
-        self.folder, self.end = folder, time.monotonic() + 60 * minutes
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, output: Path, quick: bool = False, minutes: float = float("inf")):
+        self.folder = output.parent / "parts" / (output.name + ("-quick" if quick else ""))
+        self.end = time.monotonic() + 60 * minutes
+        self.folder.mkdir(parents=True, exist_ok=True)
 
     def get(self, name: str, make):
         """The piece of that name: as it lies there, else as `make()` makes it. None: out of time."""

@@ -235,7 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(json.dumps(engine_alone(*case) if what == "engine" else measured(what, *case)))
         return 0
     quick = options.quick
-    parts = records.Parts(options.output.parent / "parts" / ("speed-quick" if quick else "speed"), options.minutes)
+    parts = records.Parts(options.output, quick, options.minutes)
     wanted = options.only or SUITES
     size, rows, points, growth, about = 256 if quick else 1024, [], {}, {}, {}
     errors = options.errors or options.output.parent / "endtoend" / "endtoend.csv"

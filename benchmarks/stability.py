@@ -315,9 +315,7 @@ def main(arguments: list[str] | None = None) -> int:
     order = np.random.default_rng(5).permutation(len(known))
     any_kind = [known[i] for i in order]
     structured = [k for k in any_kind if k.kind in STRUCTURED]
-    parts = records.Parts(
-        options.output.parent / "parts" / ("stability-quick" if quick else "stability"), options.minutes
-    )
+    parts = records.Parts(options.output, quick, options.minutes)
     rows = []
     for seed in range(seeds):
         for family in options.families:

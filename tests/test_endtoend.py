@@ -61,10 +61,12 @@ def test_every_material_is_cast_once_in_a_pass():
 
 
 def test_finished_parts_are_not_made_again_and_none_begins_when_time_is_up(tmp_path):
-    assert records.Parts(tmp_path).get("one", lambda: [1]) == [1]
-    late = records.Parts(tmp_path, minutes=0)
+    assert records.Parts(tmp_path / "first").get("one", lambda: [1]) == [1]
+    late = records.Parts(tmp_path / "first", minutes=0)
     assert late.get("one", pytest.fail) == [1]
     assert late.get("two", pytest.fail) is None
+    for other in (records.Parts(tmp_path / "second"), records.Parts(tmp_path / "first", quick=True)):
+        assert other.get("one", lambda: [2]) == [2]
 
 
 @pytest.mark.parametrize("family", stability.FAMILIES)
