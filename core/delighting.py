@@ -7,10 +7,10 @@ Claim: with x the logarithm of the pixels, light adds to the texture, and two ki
 slow is a polynomial of up to four degrees, each as far as it exceeds what the texture's own unevenness makes of one,
 which the scatter of the means of blocks about the polynomial tells. Light is nearly grey: a change of colour has to be
 clearer than one of brightness before it is taken for light. What no polynomial follows is taken out as far as it is
-more than any texture has of slow changes. A cast shadow is a step s per channel under a matte m. Any
-texture has some best division into a light and a dark class; it is a shadow when the step is the same all along their
-border (a stone or a stain ends differently everywhere) and turns no colour but a little towards blue, since what lights
-a shadow is the sky. The matte's slope is the border's mean profile; where the balance is unsure, it is said.
+more than any texture has of slow changes. A cast shadow is a step s per channel under a matte m. Any texture has some
+best division into a light and a dark class; it is a shadow when the step is the same all along their border (a stone or
+a stain ends differently everywhere) and turns no colour but a little towards blue, since what lights a shadow is the
+sky. The matte's slope is the border's mean profile; where the balance is unsure, it is said.
 
 Sources: Oppenheim et al. 1968 (homomorphic filtering); James and Stein 1961 (shrinkage); Knutsson and Westin 1993
 (normalised convolution); Finlayson et al. 2006 (log chromaticity of shadows); Guo, Dai and Hoiem 2011 (equal texture on

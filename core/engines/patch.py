@@ -12,8 +12,8 @@ F are the principal components of the patch around a pixel, o says how often a s
 the continuations of the neighbours' sources (coherence) and random jumps of falling reach. The texture is E(c), its
 patches matched once more, at three scales. All indices wrap, so it tiles by construction; c carries any channel of the
 exemplar along. Of several samples down to half the resolution the one that looks most like the exemplar is finished.
-Where the exemplar repeats with a period, the tile is a whole number of periods and a source that is out of phase costs
-more: courses stay straight and close.
+A region too thin for blocks begins from scattered patches. Where the exemplar repeats with a period, the tile is a
+whole number of periods and a source that is out of phase costs more: courses stay straight and close.
 
 Sources: Efros and Freeman 2001 (quilting), Kwatra et al. 2005 (texture optimisation), Lefebvre and Hoppe 2005
 (coordinates, coherence, PCA), Barnes et al. 2009 (PatchMatch), Kaspar et al. 2015 (occurrence, guidance by periods),
