@@ -76,7 +76,8 @@ def find_light(
     Slow changes have a geometric mean of 1 over the region; a cast shadow is less than 1, its lit side 1.
     """
     h, w = mask.shape
-    grid, inside, scale = reduce_to_grid(np.log(np.maximum(pixels, DARKEST)), mask)
+    x = np.log(np.maximum(pixels, DARKEST))
+    grid, inside, scale = reduce_to_grid(x, mask)
     progress(0.1)
     shadow = _find_shadow(grid, inside, lambda fraction: progress(0.1 + 0.7 * fraction))
     cast = (
@@ -85,18 +86,19 @@ def find_light(
     slow = _slow(grid - cast, inside, scale)
     # beyond a thin region its trend goes anywhere
     slow = np.clip(slow, slow[inside].min(0), slow[inside].max(0))
+    rest = grid - cast - slow
     whole = cv2.resize(slow, (w, h), interpolation=cv2.INTER_LINEAR)
     cast_there = np.zeros_like(whole)
     unsure, shaded = np.zeros((h, w), bool), 0.0
     if shadow is not None:
         distance = cv2.resize(shadow.distance, (w, h), interpolation=cv2.INTER_LINEAR)
         cast_there = shadow.step * (_matte(distance, shadow.sigma) - 1)[..., None]
-        unbalanced = _unbalanced((grid - cast - slow) @ LUMINANCE, inside, shadow).astype(np.uint8)
+        unbalanced = _unbalanced(rest @ LUMINANCE, inside, shadow).astype(np.uint8)
         unsure = mask & ((np.abs(distance) < UNSURE) | (cv2.resize(unbalanced, (w, h)) > 0))
         shaded = float((distance[mask] < 0).mean())
-    texture = np.log(np.maximum(pixels[mask], DARKEST)) - (whole + cast_there)[mask]
     if np.sqrt(inside.sum()) * scale > LEAST_WIDE:
-        left = _left(grid - cast - slow, inside, float(texture.var(0).sum()))
+        texture = (x - whole - cast_there)[mask]
+        left = _left(rest, inside, float(texture.var(0).sum()))
         whole += cv2.resize(left, (w, h), interpolation=cv2.INTER_LINEAR)
     return Light(np.exp(whole + cast_there), np.exp(cast_there), unsure, shaded)
 
