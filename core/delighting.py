@@ -115,10 +115,10 @@ def _unbalanced(rest: np.ndarray, inside: np.ndarray, shadow: "_Border") -> np.n
     return near & ((mean < low - margin) | (mean > high + margin))
 
 
-def reduce_to_grid(x: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean of x (h, w, C) over the mask on a grid of at most GRID px, the cells inside, and px per cell."""
+def reduce_to_grid(x: np.ndarray, mask: np.ndarray, most: int = GRID) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean of x (h, w, C) over the mask on a grid of at most `most` px, the cells inside, and px per cell."""
     h, w = mask.shape
-    scale = max(1.0, max(h, w) / GRID)
+    scale = max(1.0, max(h, w) / most)
     size = max(1, round(w / scale)), max(1, round(h / scale))
     weight = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     value = cv2.resize(np.where(mask[..., None], x, 0), size, interpolation=cv2.INTER_AREA)
@@ -136,14 +136,14 @@ def masked_blur(x: np.ndarray, inside: np.ndarray, sigma: float) -> np.ndarray:
     return value / (weight if x.ndim == 2 else weight[..., None])
 
 
-def _polynomial(shape: tuple[int, int], degree: int) -> np.ndarray:
+def polynomial(shape: tuple[int, int], degree: int) -> np.ndarray:
     """(h, w, T) terms up to a degree: 1, 3, 6, 10 or 15."""
     h, w = shape
     v, u = np.mgrid[-1 : 1 : h * 1j, -1 : 1 : w * 1j].astype(np.float32)
     return np.stack([u ** (d - k) * v**k for d in range(degree + 1) for k in range(d + 1)], -1)
 
 
-def _fit(terms: np.ndarray, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
+def fit(terms: np.ndarray, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Coefficients (T,) or (T, C) of x over the terms (h, w, T), least squares."""
     a = terms[inside].astype(np.float64)
     # few terms, all of order one: the normal equations are exact enough, and fast
@@ -156,7 +156,7 @@ def _slow(x: np.ndarray, inside: np.ndarray, scale: float) -> np.ndarray:
     area = int(inside.sum())
     blocks = int(np.clip(np.sqrt(area) * scale / LEAST_BLOCK, 2, BLOCKS))
     degree = 4 if blocks == BLOCKS else 2
-    terms = _polynomial(inside.shape, degree).astype(np.float64)
+    terms = polynomial(inside.shape, degree).astype(np.float64)
     # orthonormal over the region, the lower degrees first
     triangle = np.linalg.qr(terms[inside], mode="r")
     terms = terms @ np.linalg.pinv(triangle)
@@ -208,8 +208,8 @@ def _find_shadow(x: np.ndarray, inside: np.ndarray, progress: Callable[[float], 
         return None
     # the step over the whole region: the border's own is exact only where no light spreads across it
     matte = _matte(chosen.distance, chosen.sigma)
-    terms = np.concatenate([_polynomial(inside.shape, 1), matte[..., None]], -1)
-    step = _fit(terms, x, inside & (np.abs(chosen.distance) > UNSURE))[-1]
+    terms = np.concatenate([polynomial(inside.shape, 1), matte[..., None]], -1)
+    step = fit(terms, x, inside & (np.abs(chosen.distance) > UNSURE))[-1]
     # a trend that is no plane leaks into it; the border's own step bounds how much
     limit = np.maximum(0.25 * np.abs(chosen.step), 0.06)
     chosen.step = np.clip(step, chosen.step - limit, chosen.step + limit)
@@ -223,12 +223,12 @@ def _divisions(y: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
     for share in (0.02, 0.05):
         smooth = masked_blur(y, inside, share * side)
         for degree in (0, 1, 2):
-            terms = _polynomial(inside.shape, degree)
-            rest = smooth - terms @ _fit(terms, smooth, inside)
+            terms = polynomial(inside.shape, degree)
+            rest = smooth - terms @ fit(terms, smooth, inside)
             lit = inside & (rest > _otsu(rest[inside]))
             for _ in range(4):
                 both = np.concatenate([terms, lit[..., None].astype(np.float32)], -1)
-                weights = _fit(both, smooth, inside)
+                weights = fit(both, smooth, inside)
                 lit = inside & (smooth - terms @ weights[:-1] > weights[-1] / 2)
             alike = (np.mean((lit == other)[inside]) for other in found)
             if 0.06 < lit.sum() / inside.sum() < 0.94 and all(share < 0.95 for share in alike):
@@ -255,10 +255,10 @@ def sharpened(x: np.ndarray, inside: np.ndarray, lit: np.ndarray) -> np.ndarray:
     for share in (0.03, 0.012):
         reach = share * side
         sure = masked_blur(lit.astype(np.float32), inside, reach)
-        terms = np.concatenate([_polynomial(inside.shape, 1), sure[..., None]], -1)
+        terms = np.concatenate([polynomial(inside.shape, 1), sure[..., None]], -1)
         cell = np.zeros(inside.shape, int)
         for feature, count in zip(features, bins, strict=True):
-            rest = feature - terms[..., :-1] @ _fit(terms, feature, inside)[:-1]
+            rest = feature - terms[..., :-1] @ fit(terms, feature, inside)[:-1]
             low, high = np.percentile(rest[inside], (0.5, 99.5))
             step = (rest - low) / max(high - low, 1e-3) * count
             cell = cell * count + np.clip(step.astype(int), 0, count - 1)

@@ -27,6 +27,7 @@ from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
 from .perceptual import Crops
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
+from .sides import largest_side
 from .tensors import read_tensors, write_tensors
 from .torus import resize
 
@@ -519,12 +520,23 @@ def _exemplar(flat: rectification.Rectification, settings: Settings, progress: P
 
 
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
+    """The region seen from the front, or as it is; of a region on a solid's several sides the largest."""
+    mask, warnings = region.mask, []
+    if settings.flatten and region.corners is None:
+        progress(0.0, "looking for the sides of the region")
+        mask = largest_side(pixels, mask)
+        share = 1 - mask.sum() / region.mask.sum()
+        if share:
+            warnings.append(f"{share:.0%} of the region, on another side or in another light, is left out")
+    progress(0.1, "rectifying")
     if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
-        return rectification.Rectification(pixels, region.mask)
-    progress(0.0, "rectifying")
-    if region.corners is not None:
-        return rectification.rectify_corners(pixels, region.mask, region.corners, focal)
-    return rectification.rectify(pixels, region.mask, view or rectification.look(pixels, focal))
+        flat = rectification.Rectification(pixels, mask)
+    elif region.corners is not None:
+        flat = rectification.rectify_corners(pixels, mask, region.corners, focal)
+    else:
+        flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
+    flat.warnings[:0] = warnings
+    return flat
 
 
 def write_material(material: Material, folder: Path) -> dict:

@@ -32,7 +32,7 @@ from .image import linear_from_srgb, srgb_from_linear
 from .material import SVBRDF
 from .torus import resize
 
-VISIBLE = 0.024  # FLIP, mean over a window; whole pictures then differ by less than 0.02 (benchmarks/needs.py)
+VISIBLE = 0.023  # FLIP, mean over a window; whole pictures then differ by less than 0.02 (benchmarks/needs.py)
 WORST = 2.0
 WINDOW = 128  # px, two degrees of the view
 LEAST_SIDE = 16  # px

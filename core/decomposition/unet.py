@@ -62,7 +62,7 @@ def decompose(
     texture = np.roll(texture, (-origin[0], -origin[1]), (0, 1))
     encoded = srgb_from_linear(np.clip(texture, 0, 1)).astype(np.float32)
     with torch.no_grad():
-        material, kind = net.recognise(_overview(encoded))
+        material, kind = net.recognise(overview(encoded))
         whole = net.describe(_samples(encoded), material)
         out = _tiled(net, encoded, whole, progress)
         mean = net.mean_roughness(kind).clamp(LEAST_ROUGHNESS, 1).item()
@@ -101,7 +101,7 @@ def _origin(texture: np.ndarray) -> tuple[int, int]:
     return tuple(int(i) for i in np.unravel_index(total.argmax(), total.shape))
 
 
-def _overview(encoded: np.ndarray) -> torch.Tensor:
+def overview(encoded: np.ndarray) -> torch.Tensor:
     """(1, 3, H, W), sides multiples of STRIDE, at most OVERVIEW."""
     share = min(1.0, OVERVIEW / max(encoded.shape[:2]))
     h, w = (max(STRIDE, round(side * share / STRIDE) * STRIDE) for side in encoded.shape[:2])

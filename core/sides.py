@@ -1,0 +1,175 @@
+"""The sides of what a region covers: a box, a step or the corner of a house has several, each seen under its own slant.
+
+Claim: where a surface bends, its brightness steps along a straight line, and stays there. A texture's own edges
+(courses, planks, joints) are short, come in series, or what lies beyond them is no brighter or darker than the texture
+is within. So the region is cut along the lines on which the mean beside them steps evenly, and of the parts the largest
+is kept, with those that do not differ from it. A straight shadow, a plinth and a band of another paint are cut off by
+the same rule.
+
+Sources: Canny 1986 (crests of the gradient), Duda and Hart 1972 (lines by their angle and place).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from .delighting import DARKEST, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
+
+CELLS = 112  # longest side of the grid on which is looked
+LEAST_SIDE = 84  # px: side of the square with the area of a region that shows enough of its texture to tell
+TURNS = 60  # directions of lines, over half a turn
+LEAST_STEP = 0.12  # of log luminance
+MOST_USUAL = 3.0  # times the median over all lines: a step that stands out
+# in sides of the square with the region's area
+REACH, STRETCH = 0.07, 0.1  # what is averaged on each side of a line, across and along
+SHORTEST = 0.22  # length of a line
+EVEN, LEAST_EVEN = 0.4, 0.8  # share of a line's own step by which most of its stretches differ at most
+MOST_LINES = 8
+# as many lines of about one direction (degrees) are those of planks, courses or steps
+SERIES, PARALLEL = 3, 12.0
+LONGER = 0.6  # of its length, that a line may go on at each end until it meets another or leaves the region
+APART = 3.0  # deviations of the slow changes within the side that is kept, by which another one differs
+LEAST_SHARE = 0.25  # of the region, that is kept; what falls into smaller parts is one surface
+LEAST_LOST = 0.02  # of the region; less harms nobody
+
+
+@dataclass
+class _Line:
+    ends: np.ndarray  # (2, 2): cells (x, y)
+    step: float
+    weight: float
+
+
+def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The mask (H, W) bool without the parts that lie on other sides than most of it; itself where there are none.
+
+    pixels (H, W, 3) float32 linear; mask with at least one pixel.
+    """
+    if np.sqrt(mask.sum()) < LEAST_SIDE:
+        return mask
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    grid, inside, _ = reduce_to_grid(np.log(np.maximum(pixels[box], DARKEST)), mask[box], CELLS)
+    y = (grid @ LUMINANCE).astype(np.float32)
+    side = float(np.sqrt(inside.sum()))
+    walls = _walls(_lines(np.where(inside, y - y[inside].mean(), 0), inside, side), inside, side)
+    if not walls.any():
+        return mask
+    count, parts, facts, _ = cv2.connectedComponentsWithStats((inside & ~walls).astype(np.uint8), connectivity=4)
+    areas = facts[:, cv2.CC_STAT_AREA]
+    if count < 3 or areas[1:].max() < LEAST_SHARE * inside.sum():
+        return mask
+    kept = parts == 1 + areas[1:].argmax()
+    terms = polynomial(inside.shape, 1)
+    rest = y - terms @ fit(terms, y, kept)
+    margin = max(LEAST_STEP, APART * float(masked_blur(rest, kept, max(1.0, REACH * side / 2))[kept].std()))
+    beside = cv2.dilate(walls.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    other = np.zeros_like(inside)
+    for part in range(1, count):
+        own = parts == part
+        # what no line cuts off was painted apart from the rest
+        if own[beside].any() and abs(float(np.median(rest[own]))) >= margin:
+            other |= own
+    if other.sum() < LEAST_LOST * inside.sum():
+        return mask
+    # with the line itself, and what the lens mixes beside it
+    other = cv2.dilate(other.astype(np.uint8), np.ones((5, 5), np.uint8))
+    h, w = mask[box].shape
+    left = mask.copy()
+    left[box] &= cv2.resize(other, (w, h), interpolation=cv2.INTER_NEAREST) == 0
+    return left
+
+
+def _lines(y: np.ndarray, inside: np.ndarray, side: float) -> list[_Line]:
+    """Straight stretches along which y (h, w), 0 outside, steps evenly; those that step most first."""
+    h, w = inside.shape
+    n = int(np.ceil(np.hypot(h, w))) + 4
+    reach, stretch = max(3, round(REACH * side)), max(4, round(STRETCH * side))
+    above = np.zeros((2 * reach + 3, stretch), np.float32)
+    above[:reach] = 1
+    turns = []
+    for k in range(TURNS):
+        # lines of this direction are rows of the turned picture
+        matrix = cv2.getRotationMatrix2D((w / 2 - 0.5, h / 2 - 0.5), 180 * k / TURNS, 1)
+        matrix[:, 2] += (n - w) / 2, (n - h) / 2
+        turned, within = (cv2.warpAffine(x, matrix, (n, n)) for x in (y, inside.astype(np.float32)))
+        sums, counts = (
+            [cv2.filter2D(x, -1, kernel, borderType=cv2.BORDER_CONSTANT) for kernel in (above, above[::-1].copy())]
+            for x in (turned, within)
+        )
+        step = sums[0] / np.maximum(counts[0], 1e-3) - sums[1] / np.maximum(counts[1], 1e-3)
+        known = (np.minimum(*counts) > 0.3 * reach * stretch) & (within > 0.5)
+        turns.append((cv2.invertAffineTransform(matrix), np.where(known, step, 0)))
+    steps = np.concatenate([np.abs(step[step != 0]) for _, step in turns])
+    if not len(steps):
+        return []
+    least = max(LEAST_STEP, MOST_USUAL * float(np.median(steps)))
+    found = []
+    for back, step in turns:
+        for signed in (step, -step):
+            strong = signed >= least
+            for row in np.flatnonzero(strong.sum(1) >= SHORTEST * side):
+                found += _stretches(signed, strong, int(row), SHORTEST * side, back)
+    return sorted(found, key=lambda line: -line.weight)
+
+
+def _stretches(step: np.ndarray, strong: np.ndarray, row: int, shortest: float, back: np.ndarray) -> list[_Line]:
+    """The even stretches of a row that are steeper than the same of the rows beside it."""
+    found = []
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], strong[row], [0]]).astype(np.int8)))
+    for first, last in zip(ends[::2], ends[1::2], strict=True):
+        if last - first < shortest:
+            continue
+        values = step[row, first:last]
+        height = float(np.median(values))
+        beside = step[max(row - 1, 0) : row + 2, first:last]
+        if height < np.median(beside, 1).max() or np.mean(np.abs(values - height) < EVEN * height) < LEAST_EVEN:
+            continue
+        line = np.array([back @ (first, row, 1.0), back @ (last - 1, row, 1.0)])
+        found.append(_Line(line, height, height * (last - first)))
+    return found
+
+
+def _walls(lines: list[_Line], inside: np.ndarray, side: float) -> np.ndarray:
+    """Cells (h, w) bool on the lines, the same step drawn once, each going on until it meets another or the border."""
+    kept: list[np.ndarray] = []
+    near = drawn = np.zeros(inside.shape, bool)
+    width = 2 * max(2, round(0.05 * side)) + 1
+    for line in lines:
+        own = _drawn(inside.shape, line.ends)
+        if near[own].mean() > 0.5:
+            continue
+        kept.append(line.ends)
+        drawn = drawn | own
+        near = cv2.dilate(drawn.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
+        if len(kept) == MOST_LINES:
+            break
+    slopes = np.array([np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1])) for ends in kept])
+    apart = np.abs((slopes[:, None] - slopes + 90) % 180 - 90)
+    kept = [ends for ends, alike in zip(kept, (apart < PARALLEL).sum(1), strict=True) if alike < SERIES]
+    walls = np.zeros(inside.shape, bool)
+    for ends in kept:
+        walls |= _drawn(inside.shape, ends)
+    for i, ends in enumerate(kept):
+        others = np.zeros(inside.shape, bool)
+        for other in kept[:i] + kept[i + 1 :]:
+            others |= _drawn(inside.shape, other)
+        others = cv2.dilate(others.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        length = float(np.linalg.norm(ends[1] - ends[0]))
+        for end, along in ((ends[0], (ends[0] - ends[1]) / length), (ends[1], (ends[1] - ends[0]) / length)):
+            for t in np.arange(0, LONGER * length + 1, 0.5):
+                x, y = np.rint(end + along * t).astype(int)
+                there = 0 <= x < inside.shape[1] and 0 <= y < inside.shape[0] and inside[y, x]
+                if not there or others[y, x]:
+                    walls |= _drawn(inside.shape, np.array([end, end + along * (t + 1.5)]))
+                    break
+    # so thick that no path of four neighbours leads through
+    return cv2.dilate(walls.astype(np.uint8), np.ones((2, 2), np.uint8)) > 0
+
+
+def _drawn(shape: tuple[int, int], ends: np.ndarray) -> np.ndarray:
+    cells = np.zeros(shape, np.uint8)
+    (x0, y0), (x1, y1) = np.rint(ends).astype(int).tolist()
+    cv2.line(cells, (x0, y0), (x1, y1), 1)
+    return cells > 0
