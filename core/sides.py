@@ -73,8 +73,8 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
             other |= own
     if other.sum() < LEAST_LOST * inside.sum():
         return mask
-    # with the line itself, and what the lens mixes beside it
-    other = cv2.dilate(other.astype(np.uint8), np.ones((5, 5), np.uint8))
+    # with the line, which lies within three cells of the edge
+    other = cv2.dilate(other.astype(np.uint8), np.ones((7, 7), np.uint8))
     h, w = mask[box].shape
     left = mask.copy()
     left[box] &= cv2.resize(other, (w, h), interpolation=cv2.INTER_NEAREST) == 0

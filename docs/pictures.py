@@ -1,16 +1,18 @@
-"""Makes the README's pictures from the palettes of the two bundled examples: the sheet, and a render by Cycles.
+"""Makes the README's pictures from the palettes of the two bundled examples: sheets, a render by Cycles, a box's sides.
 
     .venv/bin/python docs/pictures.py
     .venv/bin/python docs/pictures.py WINDOW.png
 
-The first extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg and docs/render.jpg, in 3
-minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip WINDOW.png` has left.
+The first extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg, docs/render.jpg and
+docs/sides.jpg, in 4 minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip
+WINDOW.png` has left.
 """
 
 import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -19,7 +21,12 @@ import dev  # noqa: E402
 
 dev.load_package()
 import bpy  # noqa: E402
+from material_palette.benchmarks import scenes  # noqa: E402
+from material_palette.core import palette  # noqa: E402
 from material_palette.core.command import main  # noqa: E402
+from material_palette.core.image import srgb_from_linear  # noqa: E402
+from material_palette.core.region import Region  # noqa: E402
+from material_palette.core.sides import largest_side  # noqa: E402
 
 SHEETS = {"viaduct": "demo", "facade": "facade"}
 SHOWN = [("viaduct", "masonry"), ("viaduct", "rubble"), ("facade", "stone_wall"), ("facade", "red_wood")]
@@ -93,6 +100,34 @@ def render(path: Path) -> None:
     bpy.ops.render.render(write_still=True)
 
 
+def sides(folder: Path) -> np.ndarray:
+    """A crate of masonry in a rendered photo, the side of it that is learnt from, and its texture, 2 x 2, learnt from
+    the whole crate and from that side."""
+    materials = {m.name: m.svbrdf for m in palette.read_palette(folder)[1]}
+    scene = scenes.Scene("table", 11, (720, 540), 32)
+    dressed = dict(zip(scene.things, ("red_paint", "masonry", "rubble", "rubble"), strict=True))
+    scene.dress({part: materials[name] for part, name in dressed.items()}, dict.fromkeys(dressed, (0.45, 0.45)))
+    shown = scene.show()
+    mask, view = shown.masks["crate"], palette.rectification.look(shown.photo)
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    height = 360
+    photo = srgb_from_linear(shown.photo)
+    dim = np.where(largest_side(shown.photo, mask)[..., None], photo, photo * 0.25)
+    panels = []
+    for picture in (photo, dim):
+        cut = picture[rows[0] - 8 : rows[-1] + 9, columns[0] - 8 : columns[-1] + 9]
+        panels.append(cv2.resize(cut, (round(cut.shape[1] * height / cut.shape[0]), height)))
+    found = palette.largest_side
+    for search in (lambda pixels, mask: mask, found):
+        palette.largest_side = search
+        settings = palette.Settings(resolution=256)
+        made = palette.extract_material(shown.photo, Region("crate", mask), settings, lambda f, message: None, view)
+        tile = srgb_from_linear(made.svbrdf.albedo)
+        panels.append(cv2.resize(np.tile(tile, (2, 2, 1)), (height, height), interpolation=cv2.INTER_AREA))
+    palette.largest_side = found
+    return np.rint(np.concatenate(panels, 1)[..., ::-1].clip(0, 1) * 255).astype(np.uint8)
+
+
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         for picture, name in WINDOWS.items():
@@ -105,3 +140,4 @@ if __name__ == "__main__":
     rendered = ROOT / "dist" / "pictures" / "render.png"
     render(rendered)
     save(cv2.imread(str(rendered)), DOCS / "render.jpg", 1400)
+    save(sides(folders["viaduct"]), DOCS / "sides.jpg", 1400)
