@@ -263,7 +263,9 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         description="Of the photo's camera, for a sensor 36 mm wide on its longer side; 0: from the photo, or found",
     )
     flatten: BoolProperty(
-        name="Flatten Light", default=True, description="Take slow changes of light and cast shadows out of the photo"
+        name="Flatten Light",
+        default=True,
+        description="Take slow changes of light and cast shadows out of the photo; learn from one side of a box",
     )
     white_balance: EnumProperty(
         name="White Balance", items=WHITE_BALANCES, description="What to do about the colour of the light"

@@ -102,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     extract.add_argument(
         "--target-error", type=float, metavar="E", help="the cheapest quality predicted to meet it, by region (0.1)"
     )
-    extract.add_argument("--no-flatten", action="store_true", help="keep the photo's illumination in the textures")
+    extract.add_argument("--no-flatten", action="store_true", help="keep the illumination and all sides of a solid")
     extract.add_argument("--white-balance", default="off", help="off, or region: the region is grey on average (off)")
     extract.add_argument(
         "--grey-card",
