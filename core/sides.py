@@ -17,6 +17,7 @@ import numpy as np
 from .delighting import DARKEST, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
 
 CELLS = 112  # longest side of the grid on which is looked
+SEEN = 9  # px of a cell's side, at least, that are looked at in a large photo
 LEAST_SIDE = 84  # px: side of the square with the area of a region that shows enough of its texture to tell
 TURNS = 60  # directions of lines, over half a turn
 LEAST_STEP = 0.12  # of log luminance
@@ -50,7 +51,10 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return mask
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    grid, inside, _ = reduce_to_grid(np.log(np.maximum(pixels[box], DARKEST)), mask[box], CELLS)
+    # every so many-th pixel is enough for a cell's mean, and bounds the memory
+    some = slice(None, None, max(1, max(mask[box].shape) // (SEEN * CELLS)))
+    seen = np.log(np.maximum(pixels[box][some, some], DARKEST))
+    grid, inside, _ = reduce_to_grid(seen, mask[box][some, some], CELLS)
     y = (grid @ LUMINANCE).astype(np.float32)
     side = float(np.sqrt(inside.sum()))
     walls = _walls(_lines(np.where(inside, y - y[inside].mean(), 0), inside, side), inside, side)
