@@ -137,15 +137,21 @@ def _sharpness(pixels: np.ndarray, mask: np.ndarray) -> float:
     return float((fine - middle).std() / max((middle - coarse).std(), 1e-6))
 
 
+def white(pixels: np.ndarray, mask: np.ndarray) -> float:
+    """The value from which on the camera saw white within the mask; none in a photo in floats, which go on beyond 1."""
+    return CLIPPED if pixels[mask].max() <= 1.001 else np.inf
+
+
 def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and mask without what the camera saw as white or as black; appends to warnings.
 
     White specks are filled from around them: left out they would take every patch that holds one with them. A joint or
     a hole may be black; a black area is a failure.
     """
-    # a photo in floats goes on beyond 1
-    white = CLIPPED if pixels[mask].max() <= 1.001 else np.inf
-    for what, lost in (("over-exposed", (pixels >= white).any(-1)), ("under-exposed", (pixels <= BLACK).all(-1))):
+    for what, lost in (
+        ("over-exposed", (pixels >= white(pixels, mask)).any(-1)),
+        ("under-exposed", (pixels <= BLACK).all(-1)),
+    ):
         lost &= mask
         speck = SPECK if what == "over-exposed" else HOLE
         area = cv2.morphologyEx(lost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((speck, speck), np.uint8)) > 0

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from .delighting import DARKEST, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
+from .exemplar import white
 
 CELLS = 112  # longest side of the grid on which is looked
 SEEN = 9  # px of a cell's side, at least, that are looked at in a large photo
@@ -47,14 +48,16 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
     pixels (H, W, 3) float32 linear; mask with at least one pixel.
     """
-    if np.sqrt(mask.sum()) < LEAST_SIDE:
+    # a highlight is no side
+    clear = mask & (pixels < white(pixels, mask)).all(-1)
+    if np.sqrt(clear.sum()) < LEAST_SIDE:
         return mask
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     # every so many-th pixel is enough for a cell's mean, and bounds the memory
     some = slice(None, None, max(1, max(mask[box].shape) // (SEEN * CELLS)))
     seen = np.log(np.maximum(pixels[box][some, some], DARKEST))
-    grid, inside, _ = reduce_to_grid(seen, mask[box][some, some], CELLS)
+    grid, inside, _ = reduce_to_grid(seen, clear[box][some, some], CELLS)
     y = (grid @ LUMINANCE).astype(np.float32)
     side = float(np.sqrt(inside.sum()))
     walls = _walls(_lines(np.where(inside, y - y[inside].mean(), 0), inside, side), inside, side)

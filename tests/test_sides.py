@@ -83,6 +83,13 @@ def test_what_was_painted_apart_is_kept():
     assert largest_side(pixels, mask) is mask
 
 
+def test_a_highlight_is_no_side():
+    pixels, mask = textured(0.1), np.ones((SIZE, SIZE), bool)
+    pixels[:, :190] = 1.0
+    kept = largest_side(pixels, mask)
+    assert kept[:, 230:].all()
+
+
 def test_a_small_region_is_kept_whole():
     pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
     mask[:70, :70] = True
