@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from .delighting import DARKEST, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
-from .exemplar import white
+from .exemplar import PATCH, white
 
 CELLS = 112  # longest side of the grid on which is looked
 SEEN = 9  # px of a cell's side, at least, that are looked at in a large photo
@@ -44,7 +44,7 @@ class _Line:
 
 
 def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The mask (H, W) bool without the parts that lie on other sides than most of it; itself where there are none.
+    """The mask (H, W) bool without what lies on other sides than most of it does; itself where nothing does so.
 
     pixels (H, W, 3) float32 linear; mask with at least one pixel.
     """
@@ -63,11 +63,15 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     walls = _walls(_lines(np.where(inside, y - y[inside].mean(), 0), inside, side), inside, side)
     if not walls.any():
         return mask
-    count, parts, facts, _ = cv2.connectedComponentsWithStats((inside & ~walls).astype(np.uint8), connectivity=4)
-    areas = facts[:, cv2.CC_STAT_AREA]
-    if count < 3 or areas[1:].max() < LEAST_SHARE * inside.sum():
+    count, parts = cv2.connectedComponents((inside & ~walls).astype(np.uint8), connectivity=4)
+    if count < 3:
         return mask
-    kept = parts == 1 + areas[1:].argmax()
+    # the largest by what can be learnt from: a patch with a clipped pixel can't
+    sound = cv2.erode(clear[box].astype(np.uint8), np.ones((PATCH, PATCH), np.uint8)).astype(np.float32)
+    sound = cv2.resize(sound, inside.shape[::-1], interpolation=cv2.INTER_AREA)
+    kept = parts == 1 + np.bincount(parts.ravel(), sound.ravel(), count)[1:].argmax()
+    if kept.sum() < LEAST_SHARE * inside.sum():
+        return mask
     terms = polynomial(inside.shape, 1)
     rest = y - terms @ fit(terms, y, kept)
     margin = max(LEAST_STEP, APART * float(masked_blur(rest, kept, max(1.0, REACH * side / 2))[kept].std()))

@@ -90,6 +90,14 @@ def test_a_highlight_is_no_side():
     assert kept[:, 230:].all()
 
 
+def test_of_two_sides_the_one_that_the_camera_did_not_clip_is_kept():
+    pixels, mask = textured(0.25), np.ones((SIZE, SIZE), bool)
+    pixels[:, :180] = np.clip(pixels[:, :180] * 2.6, 0, 1)
+    assert 0.1 < (pixels[:, :180] == 1).mean() < 0.4
+    kept = largest_side(pixels, mask)
+    assert not kept[:, :160].any() and kept[:, 200:].all()
+
+
 def test_a_small_region_is_kept_whole():
     pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
     mask[:70, :70] = True
