@@ -139,7 +139,7 @@ def _sharpness(pixels: np.ndarray, mask: np.ndarray) -> float:
 
 def white(pixels: np.ndarray, mask: np.ndarray) -> float:
     """The value from which on the camera saw white within the mask; none in a photo in floats, which go on beyond 1."""
-    return CLIPPED if pixels[mask].max() <= 1.001 else np.inf
+    return CLIPPED if pixels.max(where=mask[..., None], initial=0) <= 1.001 else np.inf
 
 
 def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:

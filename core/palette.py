@@ -528,13 +528,12 @@ def _rectified(pixels, region, settings, view, focal, progress) -> rectification
         share = 1 - mask.sum() / region.mask.sum()
         if share:
             warnings.append(f"{share:.0%} of the region, on another side or in another light, is left out")
-    progress(0.1, "rectifying")
     if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
-        flat = rectification.Rectification(pixels, mask)
-    elif region.corners is not None:
-        flat = rectification.rectify_corners(pixels, mask, region.corners, focal)
-    else:
-        flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
+        return rectification.Rectification(pixels, mask, warnings=warnings)
+    progress(0.1, "rectifying")
+    if region.corners is not None:
+        return rectification.rectify_corners(pixels, mask, region.corners, focal)
+    flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
     flat.warnings[:0] = warnings
     return flat
 

@@ -9,17 +9,14 @@ the same rule.
 Sources: Canny 1986 (crests of the gradient), Duda and Hart 1972 (lines by their angle and place).
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
-from .delighting import DARKEST, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
+from .delighting import DARKEST, LEAST_WIDE, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
 from .exemplar import PATCH, white
 
 CELLS = 112  # longest side of the grid on which is looked
 SEEN = 9  # px of a cell's side, at least, that are looked at in a large photo
-LEAST_SIDE = 84  # px: side of the square with the area of a region that shows enough of its texture to tell
 TURNS = 60  # directions of lines, over half a turn
 LEAST_STEP = 0.12  # of log luminance
 MOST_USUAL = 3.0  # times the median over all lines: a step that stands out
@@ -36,28 +33,22 @@ LEAST_SHARE = 0.25  # of the region, that is kept; what falls into smaller parts
 LEAST_LOST = 0.02  # of the region; less harms nobody
 
 
-@dataclass
-class _Line:
-    ends: np.ndarray  # (2, 2): cells (x, y)
-    step: float
-    weight: float
-
-
 def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The mask (H, W) bool without what lies on other sides than most of it does; itself where nothing does so.
 
     pixels (H, W, 3) float32 linear; mask with at least one pixel.
     """
-    # a highlight is no side
-    clear = mask & (pixels < white(pixels, mask)).all(-1)
-    if np.sqrt(clear.sum()) < LEAST_SIDE:
-        return mask
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    cut = pixels[box]
+    h, w = cut.shape[:2]
+    # a highlight is no side
+    clear = mask[box] & (cut < white(cut, mask[box])).all(-1)
+    if np.sqrt(clear.sum()) < LEAST_WIDE:
+        return mask
     # every so many-th pixel is enough for a cell's mean, and bounds the memory
-    some = slice(None, None, max(1, max(mask[box].shape) // (SEEN * CELLS)))
-    seen = np.log(np.maximum(pixels[box][some, some], DARKEST))
-    grid, inside, _ = reduce_to_grid(seen, clear[box][some, some], CELLS)
+    some = slice(None, None, max(1, max(h, w) // (SEEN * CELLS)))
+    grid, inside, _ = reduce_to_grid(np.log(np.maximum(cut[some, some], DARKEST)), clear[some, some], CELLS)
     y = (grid @ LUMINANCE).astype(np.float32)
     side = float(np.sqrt(inside.sum()))
     walls = _walls(_lines(np.where(inside, y - y[inside].mean(), 0), inside, side), inside, side)
@@ -67,7 +58,7 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if count < 3:
         return mask
     # the largest by what can be learnt from: a patch with a clipped pixel can't
-    sound = cv2.erode(clear[box].astype(np.uint8), np.ones((PATCH, PATCH), np.uint8)).astype(np.float32)
+    sound = cv2.erode(clear.astype(np.uint8), np.ones((PATCH, PATCH), np.uint8)).astype(np.float32)
     sound = cv2.resize(sound, inside.shape[::-1], interpolation=cv2.INTER_AREA)
     kept = parts == 1 + np.bincount(parts.ravel(), sound.ravel(), count)[1:].argmax()
     if kept.sum() < LEAST_SHARE * inside.sum():
@@ -86,14 +77,13 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return mask
     # with the line, which lies within three cells of the edge
     other = cv2.dilate(other.astype(np.uint8), np.ones((7, 7), np.uint8))
-    h, w = mask[box].shape
     left = mask.copy()
     left[box] &= cv2.resize(other, (w, h), interpolation=cv2.INTER_NEAREST) == 0
     return left
 
 
-def _lines(y: np.ndarray, inside: np.ndarray, side: float) -> list[_Line]:
-    """Straight stretches along which y (h, w), 0 outside, steps evenly; those that step most first."""
+def _lines(y: np.ndarray, inside: np.ndarray, side: float) -> list[np.ndarray]:
+    """Ends (2, 2), cells (x, y), of straight lines along which y (h, w), 0 outside, steps evenly; greatest first."""
     h, w = inside.shape
     n = int(np.ceil(np.hypot(h, w))) + 4
     reach, stretch = max(3, round(REACH * side)), max(4, round(STRETCH * side))
@@ -122,11 +112,11 @@ def _lines(y: np.ndarray, inside: np.ndarray, side: float) -> list[_Line]:
             strong = signed >= least
             for row in np.flatnonzero(strong.sum(1) >= SHORTEST * side):
                 found += _stretches(signed, strong, int(row), SHORTEST * side, back)
-    return sorted(found, key=lambda line: -line.weight)
+    return [ends for _, ends in sorted(found, key=lambda line: -line[0])]
 
 
-def _stretches(step: np.ndarray, strong: np.ndarray, row: int, shortest: float, back: np.ndarray) -> list[_Line]:
-    """The even stretches of a row that are steeper than the same of the rows beside it."""
+def _stretches(step: np.ndarray, strong: np.ndarray, row: int, shortest: float, back: np.ndarray) -> list[tuple]:
+    """Step times length, and ends, of a row's even stretches that are steeper than the same of the rows beside it."""
     found = []
     ends = np.flatnonzero(np.diff(np.concatenate([[0], strong[row], [0]]).astype(np.int8)))
     for first, last in zip(ends[::2], ends[1::2], strict=True):
@@ -137,36 +127,30 @@ def _stretches(step: np.ndarray, strong: np.ndarray, row: int, shortest: float, 
         beside = step[max(row - 1, 0) : row + 2, first:last]
         if height < np.median(beside, 1).max() or np.mean(np.abs(values - height) < EVEN * height) < LEAST_EVEN:
             continue
-        line = np.array([back @ (first, row, 1.0), back @ (last - 1, row, 1.0)])
-        found.append(_Line(line, height, height * (last - first)))
+        found.append((height * (last - first), np.array([back @ (x, row, 1.0) for x in (first, last - 1)])))
     return found
 
 
-def _walls(lines: list[_Line], inside: np.ndarray, side: float) -> np.ndarray:
+def _walls(lines: list[np.ndarray], inside: np.ndarray, side: float) -> np.ndarray:
     """Cells (h, w) bool on the lines, the same step drawn once, each going on until it meets another or the border."""
-    kept: list[np.ndarray] = []
-    near = drawn = np.zeros(inside.shape, bool)
+    kept: list[tuple[np.ndarray, np.ndarray]] = []  # ends and cells of each
+    near = np.zeros(inside.shape, bool)
     width = 2 * max(2, round(0.05 * side)) + 1
-    for line in lines:
-        own = _drawn(inside.shape, line.ends)
+    for ends in lines:
+        own = _drawn(inside.shape, ends)
         if near[own].mean() > 0.5:
             continue
-        kept.append(line.ends)
-        drawn = drawn | own
-        near = cv2.dilate(drawn.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
+        kept.append((ends, own))
+        near |= cv2.dilate(own.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
         if len(kept) == MOST_LINES:
             break
-    slopes = np.array([np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1])) for ends in kept])
+    slopes = np.array([np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1])) for ends, _ in kept])
     apart = np.abs((slopes[:, None] - slopes + 90) % 180 - 90)
-    kept = [ends for ends, alike in zip(kept, (apart < PARALLEL).sum(1), strict=True) if alike < SERIES]
-    walls = np.zeros(inside.shape, bool)
-    for ends in kept:
-        walls |= _drawn(inside.shape, ends)
-    for i, ends in enumerate(kept):
-        others = np.zeros(inside.shape, bool)
-        for other in kept[:i] + kept[i + 1 :]:
-            others |= _drawn(inside.shape, other)
-        others = cv2.dilate(others.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    kept = [line for line, alike in zip(kept, (apart < PARALLEL).sum(1), strict=True) if alike < SERIES]
+    times = sum((own.astype(np.uint8) for _, own in kept), np.zeros(inside.shape, np.uint8))
+    walls = times > 0
+    for ends, own in kept:
+        others = cv2.dilate(((times - own) > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         length = float(np.linalg.norm(ends[1] - ends[0]))
         for end, along in ((ends[0], (ends[0] - ends[1]) / length), (ends[1], (ends[1] - ends[0]) / length)):
             for t in np.arange(0, LONGER * length + 1, 0.5):

@@ -62,9 +62,9 @@ def described_textures(net: SvbrdfNet, folder: Path, names: list[str]) -> tuple[
         texture = read_pixels(folder / name).astype(np.float32) / 255
         for times in REPEATS:
             features.append(net.recognise(overview(np.tile(texture, (times, times, 1))))[1].numpy())
-            roughness.append([float(mean)])
-            numbers.append([names.index(material)])
-    return tuple(np.concatenate(x) for x in (features, roughness, numbers))
+            roughness.append(float(mean))
+            numbers.append(names.index(material))
+    return np.concatenate(features), np.array(roughness), np.array(numbers)
 
 
 def fit(x: np.ndarray, y: np.ndarray, weight: np.ndarray, drawn: tuple) -> tuple[np.ndarray, float]:
@@ -122,14 +122,14 @@ def main() -> None:
 
     folds = np.random.default_rng(0).permutation(len(training)) % FOLDS
     for name, fold in (("materials", folds), ("collections", np.unique(collection, return_inverse=True)[1])):
-        for learnt in dict.fromkeys(("lit", "lit, scenes" if options.scenes else "lit")):
-            errors = left_out(fold, np.isin(kind, learnt.split(", ")))
+        for learnt in (list(parts)[: n + 1] for n in range(len(parts))):
+            errors = left_out(fold, np.isin(kind, learnt))
             for part in parts:
                 found, constant = (errors[kind == part] ** 2).mean(0)
                 off = np.abs(errors[kind == part, 0])
                 print(
-                    f"{name} left out, learnt from {learnt}, on {part}: {found:.4f}, constant {constant:.4f}; "
-                    f"off by {off.mean():.3f}, median {np.median(off):.3f}"
+                    f"{name} left out, learnt from {', '.join(learnt)}, on {part}: {found:.4f}, "
+                    f"constant {constant:.4f}; off by {off.mean():.3f}, median {np.median(off):.3f}"
                 )
     metal = np.array([s.metallic is not None and s.metallic.mean() > 127 for s in training])[number]
     score = np.zeros(len(metal))

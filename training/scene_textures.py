@@ -65,19 +65,17 @@ def main() -> None:
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)
     table, materials = options.output / TABLE, known(options.data)
-    rows = list(csv.reader(table.open(newline="", encoding="utf-8"))) if table.exists() else []
-    done = {int(row[0].split("_")[0]) for row in rows}
+    rows = table.read_text(encoding="utf-8").splitlines() if table.exists() else []
+    done = {int(row.split("_")[0]) for row in rows}
     for number in range(FIRST, FIRST + options.scenes):
         if number in done:
             continue
-        for part, name, roughness, texture in textures(
-            number, materials, (scenes.WIDTH, scenes.HEIGHT), scenes.SAMPLES
-        ):
+        found = textures(number, materials, (scenes.WIDTH, scenes.HEIGHT), scenes.SAMPLES)
+        for part, _, _, texture in found:
             write_image(options.output / f"{number}_{part}.png", srgb_from_linear(texture.clip(0, 1)))
-            rows.append([f"{number}_{part}.png", name, f"{roughness:.4f}"])
-        with table.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(rows)
-        print(number, len(rows), flush=True)
+        with table.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([f"{number}_{part}.png", name, f"{r:.4f}"] for part, name, r, _ in found)
+        print(number, len(found), flush=True)
 
 
 if __name__ == "__main__":
