@@ -145,13 +145,12 @@ def white(pixels: np.ndarray, mask: np.ndarray) -> float:
 def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and mask without what the camera saw as white or as black; appends to warnings.
 
-    White specks are filled from around them: left out they would take every patch that holds one with them. A joint or
-    a hole may be black; a black area is a failure.
+    An area is left out where one channel is at its end, for its hue is wrong. Of specks those of plain white are filled
+    from around them: left out they would take every patch that holds one with them; in the others there is texture yet.
+    A joint or a hole may be black; a black area is a failure.
     """
-    for what, lost in (
-        ("over-exposed", (pixels >= white(pixels, mask)).any(-1)),
-        ("under-exposed", (pixels <= BLACK).all(-1)),
-    ):
+    ends = pixels >= white(pixels, mask)
+    for what, lost in (("over-exposed", ends.any(-1)), ("under-exposed", (pixels <= BLACK).all(-1))):
         lost &= mask
         speck = SPECK if what == "over-exposed" else HOLE
         area = cv2.morphologyEx(lost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((speck, speck), np.uint8)) > 0
@@ -163,15 +162,26 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
             elif share > LEAST_SAID:
                 warnings.append(f"{share:.0%} of the region is {what} and left out")
             mask = left
-        specks = lost & ~_widened(area)
+        specks = mask & ends.all(-1) & ~_widened(area)
         if what == "over-exposed" and specks.any():
             share = specks.sum() / mask.sum()
             if share > LEAST_SAID:
                 warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")
-            specks = mask & _widened(specks)
-            around = masked_blur(pixels, mask & ~specks, SPECK / 2)
-            pixels = np.where(specks[..., None] & (around.sum(-1, keepdims=True) > 0), around, pixels)
+            pixels = _filled(pixels, mask, mask & _widened(specks))
     return pixels, mask
+
+
+def _filled(pixels: np.ndarray, mask: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """Pixels (h, w, 3) where those lost (h, w) bool are the mean of the others of the mask beside them, inwards."""
+    known = mask & ~lost
+    while known.any() and lost.any():
+        # farther away nothing would be left of the others' weight
+        near = lost & (cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) <= SPECK)
+        if not near.any():
+            break
+        pixels = np.where(near[..., None], masked_blur(pixels, known, SPECK / 2), pixels)
+        known, lost = known | near, lost & ~near
+    return pixels
 
 
 def _widened(lost: np.ndarray) -> np.ndarray:

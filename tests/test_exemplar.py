@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core.errors import PaletteError
-from material_palette.core.exemplar import card_colour, cut_exemplar
+from material_palette.core.exemplar import _filled, card_colour, cut_exemplar
 from material_palette.core.image import linear_from_srgb, srgb_from_linear
 from textures import pebbles
 
@@ -84,6 +84,26 @@ def test_one_clipped_channel_is_over_exposed_and_a_bright_photo_in_floats_is_not
     assert not cut_exemplar(pixels, full(pixels)).mask[:20].any()
     bright = 6 * linear_from_srgb(0.2 + 0.6 * pebbles(100, 100))
     assert cut_exemplar(bright, full(bright)).mask.mean() > 0.98
+
+
+def test_specks_of_plain_white_are_filled_and_those_of_one_channel_kept():
+    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(120, 120))
+    photo = pixels.copy()
+    photo[20:100:10, 20:60:4] = 1.0
+    photo[20:100:10, 70:110:4, 0] = 1.0
+    found = cut_exemplar(photo, full(photo), flatten=False).pixels
+    assert found[20:100:10, 20:60:4].max() < 0.9
+    assert np.array_equal(found[:, 65:], photo[:, 65:])
+
+
+def test_specks_far_from_all_others_are_filled_too():
+    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(120, 120))
+    lost = np.zeros((120, 120), bool)
+    lost[30:90, 30:90] = True
+    found = _filled(np.where(lost[..., None], 1.0, pixels), full(pixels), lost)
+    assert found[lost].min() > pixels.min() and found[lost].max() < pixels.max()
+    assert np.array_equal(found[~lost], pixels[~lost])
+    assert np.array_equal(_filled(pixels, lost, lost), pixels)  # there are no others
 
 
 def test_a_black_area_is_left_out_and_a_black_joint_kept():
