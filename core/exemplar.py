@@ -21,6 +21,7 @@ WHITE_BALANCES = ("off", "region", "card")
 GREY_CARD = 0.18  # reflectance of what photographers hold into the light
 UNEVEN = 0.3  # deviation over mean of a card's luminance; what varies more shows something else too
 CLIPPED = 0.98  # linear; above it the camera saw white
+PLAIN = 0.8  # linear: of a channel's least in plain white, where another one is clipped
 BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
 PATCH = 7  # px: what an engine learns from at least
 LEAST_PATCHES = 400
@@ -162,7 +163,7 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
             elif share > LEAST_SAID:
                 warnings.append(f"{share:.0%} of the region is {what} and left out")
             mask = left
-        specks = mask & ends.all(-1) & ~_widened(area)
+        specks = mask & ends.any(-1) & (pixels.min(-1) > PLAIN) & ~_widened(area)
         if what == "over-exposed" and specks.any():
             share = specks.sum() / mask.sum()
             if share > LEAST_SAID:
