@@ -30,7 +30,11 @@ LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
 ENOUGH_LINES = 100
 LEAST_CONFIDENCE = 0.5
 SUSPECTED = 0.05  # confidence from which on a slant that was not told for certain is worth a warning
-SHARE = 0.5  # of the exemplar's texel density, below which a part is seen too obliquely
+# of a texel's density in the photo, in the worst direction
+SHARE_BENT = 0.5  # of the exemplar's, below which a part of a column is seen too obliquely
+SHARPNESS = 2.0  # a plane's texel counts by this power
+SHARE, LEAST_SHARE = 0.7, 0.35  # of what is chosen then, below which a part is seen too obliquely
+ENOUGH = 160 * 160  # px of the photo that are learnt from, where LEAST_SHARE allows
 MOST_SAMPLES = 4  # per texel and axis
 DARKEST = 1e-3
 
@@ -132,7 +136,7 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     estimate = find_plane(pixels, mask, view)
     bent = _find_cylinder(estimate, view, mask.shape) if estimate is not None else None
     if bent is not None:
-        flat, within, to_surface = unroll(pixels, mask, bent, SHARE, LARGEST)
+        flat, within, to_surface = unroll(pixels, mask, bent, SHARE_BENT, LARGEST)
         return Rectification(flat, within, method="cylinder", cylinder=bent, to_surface=to_surface)
     if estimate is not None and estimate.slant < LEAST_SLANT:
         return Rectification(pixels, mask, normal=-estimate.normal, confidence=estimate.confidence)
@@ -418,9 +422,10 @@ def resample(
 ) -> Rectification:
     """Resample a region onto its plane.
 
-    to_photo (3, 3): homography from the plane, any unit, to photo px. A texel is as large as the photo shows most of
-    the region at least: of all texel sizes, the one at which the photo has the most texels of its own. What is seen
-    more obliquely than SHARE of that is left out, and of what is larger than LARGEST the fullest part is taken.
+    to_photo (3, 3): homography from the plane, any unit, to photo px. Learnt from is the part that is seen best, of a
+    floor the near one: of all densities that one counts at which the photo has the most texels of its own, fine ones
+    counting more (SHARPNESS), and a texel is as large as a photo px there. What is seen more obliquely than SHARE of
+    that is left out, unless less than ENOUGH were left; of what is larger than LARGEST the fullest part is taken.
     Raises PaletteError when nothing remains.
     """
     y, x = np.nonzero(mask)
@@ -433,9 +438,12 @@ def resample(
     if not good.any():
         raise PaletteError("the region lies beyond the horizon of its plane; give other corners or turn rectify off")
     order = np.argsort(-density[good], kind="stable")
-    texels = np.cumsum(np.abs(area[good][order])) * density[good][order] ** 2
-    scale = float(density[good][order][texels.argmax()])
-    kept = good & (density >= SHARE * scale)
+    sorted_density, sorted_area = density[good][order], np.abs(area[good][order])
+    best = (np.cumsum(sorted_area) * sorted_density ** (2 + SHARPNESS)).argmax()
+    scale = 1 / float(np.sqrt(sorted_area[best]))
+    enough = sorted_density[min(len(order) - 1, ENOUGH * len(points) // len(x))]
+    least = max(LEAST_SHARE * sorted_density[best], min(SHARE * sorted_density[best], enough))
+    kept = good & (density >= least)
     low, high = (f(_mapped(np.linalg.inv(to_photo), points[kept]), 0) for f in (np.min, np.max))
     side = (high - low) * scale + 2
     to_plane = np.array([[1 / scale, 0, low[0]], [0, 1 / scale, low[1]], [0, 0, 1]])
@@ -457,7 +465,7 @@ def resample(
         texels, facing = _density(np.linalg.inv(homography), back)
         inside = (back >= 0).all(1) & (back <= [mask.shape[1] - 1, mask.shape[0] - 1]).all(1)
         column, row = np.rint(np.where(inside[:, None], back, 0)).astype(int).T
-        within[part : part + (1 << 18)] = inside & facing & (texels >= SHARE) & mask[row, column]
+        within[part : part + (1 << 18)] = inside & facing & (texels >= least / scale) & mask[row, column]
     within = within.reshape(h, w)
     if not within.any():
         raise PaletteError("the region is seen too obliquely to be rectified; paint a nearer part of it")

@@ -132,6 +132,25 @@ def test_what_is_seen_too_obliquely_is_left_out():
     assert rows.min() > 60 and rows.max() > 360  # the far part is gone, the near one kept
 
 
+def test_of_a_floor_the_near_part_keeps_its_detail_and_a_small_region_more_of_its_area():
+    stripes = np.where(np.arange(512) % 8 < 4, 0.2, 0.6).astype(np.float32)
+    texture = np.repeat(np.broadcast_to(stripes, (512, 512))[..., None], 3, -1).copy()
+    normal = tilted(65, np.pi / 2)
+    pixels = slanted(texture, normal)
+    to_photo = rectification.plane_to_photo(normal, FOCAL * 384, (191.5, 191.5), (191.5, 191.5))
+    found = rectification.resample(pixels, np.ones((384, 384), bool), to_photo)
+    inside = cv2.erode(np.pad(found.mask, 1).astype(np.uint8), np.ones((7, 7)))[1:-1, 1:-1] > 0
+    assert found.pixels[inside].std() > 0.9 * pixels[340:].std()
+    shares = []
+    for half in (190, 60):
+        mask = np.zeros((384, 384), bool)
+        mask[192 - half : 192 + half, 192 - half : 192 + half] = True
+        kept = rectification.resample(pixels, mask, to_photo)
+        back = kept.homography @ np.stack([*np.nonzero(kept.mask)[::-1], np.ones(kept.mask.sum())])
+        shares.append(1 - (back[1] / back[2]).min() / (2 * half) + (192 - half) / (2 * half))
+    assert shares[1] > 0.95 > 0.7 > shares[0]
+
+
 @pytest.mark.parametrize("corners", [[(0, 0), (0, 9), (9, 9), (9, 0)], [(0, 0), (9, 0), (5, 1), (0, 9)], [(0, 0)] * 4])
 def test_corners_of_no_rectangle_are_refused(corners):
     with pytest.raises(PaletteError, match="clockwise"):
