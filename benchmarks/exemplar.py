@@ -32,12 +32,13 @@ import dev  # noqa: E402
 dev.load_package()
 from material_palette.benchmarks import charts, lighting, measures  # noqa: E402
 from material_palette.benchmarks.records import command, commit, machine  # noqa: E402
-from material_palette.core import rectification  # noqa: E402
+from material_palette.core import perceptual, rectification  # noqa: E402
 from material_palette.core.cylinder import Cylinder  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402
 from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
 from material_palette.core.texture_gradient import plane_axes  # noqa: E402
+from material_palette.core.torus import resize  # noqa: E402
 
 SAMPLES = 2  # of the rendered photos, per px and axis
 FALSE = 20.0  # degrees of error, from which on a claimed plane is a false one
@@ -212,6 +213,53 @@ def swd_to_flat(found: rectification.Rectification, scale: float, texture: Textu
     return measures.sliced_wasserstein(measures.patch_quantiles(made), measures.patch_quantiles(flat, whole))
 
 
+# ---------------------------------------------------------------- floors
+
+COMPARED = 192  # px of the crops of textures that are compared
+MADE = 320  # px of a synthesised texture
+
+
+def floor(texture: Texture, slant: float, random: np.random.Generator, side: int) -> Slanted:
+    """A photo of a floor, near at the bottom, up to its horizon or 16 times the distance of its middle."""
+    turn, focal = random.uniform(0, 2 * np.pi), side * random.uniform(0.9, 1.2)
+    density = random.uniform(0.7, 1.3) * min(texture.pixels.shape[:2]) / 640
+    normal = np.array([0, np.sin(np.radians(slant)), np.cos(np.radians(slant))])
+    pixels, mask = photograph(texture.pixels, normal, focal, (side, side), density, turn, random)
+    return Slanted(pixels, mask, normal, focal, density, True)
+
+
+def judge_floor(photo: Slanted, texture: Texture, full: bool) -> dict:
+    """Textures of the floor as it is seen and of the floor rectified by its known plane, to the true one, at the scale
+    at which the photo would show it from the front: detail that is lost counts."""
+    side = len(photo.mask)
+    centre = ((side - 1) / 2,) * 2
+    to_photo = rectification.plane_to_photo(photo.normal, photo.focal, centre, centre)
+    start = time.process_time()
+    found = rectification.resample(photo.pixels, photo.mask, to_photo)
+    result = {"cpu_seconds": time.process_time() - start, "megapixels": photo.mask.sum() / 1e6}
+    if full:
+        random = np.random.default_rng(0)
+        places = random.random((4, 2, 2))
+        for name, one in (("before", rectification.Rectification(photo.pixels, photo.mask)), ("after", found)):
+            scale = scale_of(one, photo) / photo.density  # px seen from the front per texel
+            exemplar = cut_exemplar(one.pixels, one.mask)
+            concept = patch.learn(srgb_from_linear(np.clip(exemplar.pixels, 0, 1)), exemplar.mask, _quiet)
+            made = resize(patch.sample(concept, (MADE, MADE), 0, _quiet, "draft").pixels, (round(MADE * scale),) * 2)
+            flat = resize(texture.pixels, tuple(round(n / photo.density) for n in texture.pixels.shape[:2]))
+            flat = srgb_from_linear(np.clip(flat, 0, 1))
+            made = np.clip(made + (flat.mean((0, 1)) - made.mean((0, 1))), 0, 1)  # the colour is not at stake
+            pairs = [[_window(x, at) for x, at in zip((flat, made), both, strict=True)] for both in places]
+            result[f"lpips_{name}"] = float(np.mean([perceptual.distance(*pair) for pair in pairs]))
+            result[f"scale_{name}"] = 1 / scale
+    return result
+
+
+def _window(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """COMPARED x COMPARED px of a picture (h, w, 3) that wraps, from a place in 0 to 1."""
+    rows, columns = ((int(a * n) + np.arange(COMPARED)) % n for a, n in zip(at, picture.shape, strict=False))
+    return np.ascontiguousarray(picture[np.ix_(rows, columns)], np.float32)
+
+
 # ---------------------------------------------------------------- curved
 
 
@@ -311,6 +359,13 @@ FAMILIES = {
         lambda texture, severity, random, side: slanted(texture, severity, random, side, known=False),
         judge_slanted,
         SLANT_CURVES[:2],
+    ),
+    "floor": Family(
+        "slant of a floor, degrees; plane known",
+        (45.0, 60.0, 70.0, 75.0),
+        floor,
+        judge_floor,
+        (("lpips", "ST-LPIPS to the flat texture"), ("scale", "texels per px seen from the front")),
     ),
     "curved": Family(
         "half-angle seen of a column, degrees",
