@@ -22,6 +22,7 @@ GREY_CARD = 0.18  # reflectance of what photographers hold into the light
 UNEVEN = 0.3  # deviation over mean of a card's luminance; what varies more shows something else too
 CLIPPED = 0.98  # linear; above it the camera saw white
 PLAIN = 0.8  # linear: of a channel's least in plain white, where another one is clipped
+GLARE = 2.0  # times what is around it: a speck that is brighter is light or noise, no texture
 BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
 PATCH = 7  # px: what an engine learns from at least
 LEAST_PATCHES = 400
@@ -146,9 +147,9 @@ def white(pixels: np.ndarray, mask: np.ndarray) -> float:
 def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and mask without what the camera saw as white or as black; appends to warnings.
 
-    An area is left out where one channel is at its end, for its hue is wrong. Of specks those of plain white are filled
-    from around them: left out they would take every patch that holds one with them; in the others there is texture yet.
-    A joint or a hole may be black; a black area is a failure.
+    An area is left out where one channel is at its end, for its hue is wrong. Specks of plain white or of GLARE are
+    filled from around them: left out they would take every patch that holds one with them; in others with a channel at
+    its end there is texture yet. A joint or a hole may be black; a black area is a failure.
     """
     ends = pixels >= white(pixels, mask)
     for what, lost in (("over-exposed", ends.any(-1)), ("under-exposed", (pixels <= BLACK).all(-1))):
@@ -163,8 +164,13 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
             elif share > LEAST_SAID:
                 warnings.append(f"{share:.0%} of the region is {what} and left out")
             mask = left
-        specks = mask & ends.any(-1) & (pixels.min(-1) > PLAIN) & ~_widened(area)
-        if what == "over-exposed" and specks.any():
+        if what == "under-exposed":
+            continue
+        specks = mask & ends.any(-1) & ~_widened(area)
+        if specks.any():
+            around = masked_blur(pixels, mask & ~ends.any(-1), SPECK)
+            glare = (pixels > GLARE * around).any(-1)
+            specks &= glare | (pixels.min(-1) > PLAIN)
             share = specks.sum() / mask.sum()
             if share > LEAST_SAID:
                 warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")

@@ -33,6 +33,7 @@ SUSPECTED = 0.05  # confidence from which on a slant that was not told for certa
 # of a texel's density in the photo, in the worst direction
 SHARE_BENT = 0.5  # of the exemplar's, below which a part of a column is seen too obliquely
 SHARPNESS = 2.0  # a plane's texel counts by this power
+FINEST = 1.4  # times what is chosen then, a texel's own
 SHARE, LEAST_SHARE = 0.7, 0.35  # of what is chosen then, below which a part is seen too obliquely
 ENOUGH = 160 * 160  # px of the photo that are learnt from, where LEAST_SHARE allows
 MOST_SAMPLES = 4  # per texel and axis
@@ -424,7 +425,8 @@ def resample(
 
     to_photo (3, 3): homography from the plane, any unit, to photo px. Learnt from is the part that is seen best, of a
     floor the near one: of all densities that one counts at which the photo has the most texels of its own, fine ones
-    counting more (SHARPNESS), and a texel is as large as a photo px there. What is seen more obliquely than SHARE of
+    counting more (SHARPNESS). A texel is as large as a photo px there, at most FINEST times as fine as a px is in its
+    worst direction, for it is blurred in that one. What is seen more obliquely than SHARE of
     that is left out, unless less than ENOUGH were left; of what is larger than LARGEST the fullest part is taken.
     Raises PaletteError when nothing remains.
     """
@@ -440,7 +442,7 @@ def resample(
     order = np.argsort(-density[good], kind="stable")
     sorted_density, sorted_area = density[good][order], np.abs(area[good][order])
     best = (np.cumsum(sorted_area) * sorted_density ** (2 + SHARPNESS)).argmax()
-    scale = 1 / float(np.sqrt(sorted_area[best]))
+    scale = min(1 / float(np.sqrt(sorted_area[best])), FINEST * float(sorted_density[best]))
     enough = sorted_density[min(len(order) - 1, ENOUGH * len(points) // len(x))]
     least = max(LEAST_SHARE * sorted_density[best], min(SHARE * sorted_density[best], enough))
     kept = good & (density >= least)

@@ -86,14 +86,17 @@ def test_one_clipped_channel_is_over_exposed_and_a_bright_photo_in_floats_is_not
     assert cut_exemplar(bright, full(bright)).mask.mean() > 0.98
 
 
-def test_specks_of_plain_white_are_filled_and_those_of_one_channel_kept():
-    pixels = linear_from_srgb(0.2 + 0.6 * pebbles(120, 120))
-    photo = pixels.copy()
+def test_specks_of_plain_white_and_of_glare_are_filled_and_a_bright_surface_kept():
+    bright = linear_from_srgb(0.7 + 0.15 * pebbles(120, 120))
+    photo = bright.copy()
     photo[20:100:10, 20:60:4] = 1.0
     photo[20:100:10, 70:110:4, 0] = 1.0
     found = cut_exemplar(photo, full(photo), flatten=False).pixels
     assert found[20:100:10, 20:60:4].max() < 0.9
     assert np.array_equal(found[:, 65:], photo[:, 65:])
+    photo[:, 65:] *= 0.3
+    photo[20:100:10, 70:110:4, 0] = 1.0
+    assert cut_exemplar(photo, full(photo), flatten=False).pixels[:, 65:].max() < 0.5
 
 
 def test_specks_far_from_all_others_are_filled_too():
