@@ -27,9 +27,9 @@ import dev  # noqa: E402
 dev.load_package()
 from material_palette.benchmarks import charts, endtoend, measures, records, svbrdf  # noqa: E402
 from material_palette.benchmarks.baselines import cross_fade, largest_square  # noqa: E402
-from material_palette.benchmarks.exemplar import photograph  # noqa: E402
+from material_palette.benchmarks.exemplar import Slanted, photograph, scale_of  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
-from material_palette.core import palette  # noqa: E402
+from material_palette.core import palette, rectification  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.exemplar import LUMINANCE  # noqa: E402
 from material_palette.core.image import linear_from_srgb, srgb_from_linear  # noqa: E402
@@ -97,9 +97,10 @@ def _blobs(random, side: int, share: float) -> np.ndarray:
 
 
 def disturbed(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: int):
-    """(photo (H, W, 3) linear, mask, px per tile) of a case; the chance is the seed's at every severity."""
+    """(photo (H, W, 3) linear, mask, px per tile, normal (3,) away from the camera of what is slanted) of a case; the
+    chance is the seed's at every severity."""
     random = np.random.default_rng([seed, sum(map(ord, family))])
-    side, tile, mask = SIDE, TILE, np.ones((SIDE, SIDE), bool)
+    side, tile, mask, normal = SIDE, TILE, np.ones((SIDE, SIDE), bool), None
     if family == "few periods":
         tile = round(SIDE / severity)
     photo = lit(maps, side, tile, random, severity if family == "uniform" else 1.0)
@@ -145,7 +146,7 @@ def disturbed(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: i
     pixels = np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8)
     if family == "JPEG" and severity < 100:
         pixels = cv2.imdecode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, int(severity)])[1], 1)
-    return linear_from_srgb(pixels / np.float32(255)), mask, tile
+    return linear_from_srgb(pixels / np.float32(255)), mask, tile, normal
 
 
 # ---------------------------------------------------------------- judging
@@ -172,7 +173,7 @@ def judged(albedo: np.ndarray, truth: np.ndarray, target: list) -> dict:
 def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: int, picture: Path | None) -> list[dict]:
     """The rows of both methods."""
     torch.set_num_threads(1)
-    photo, mask, tile = disturbed(family, severity, maps, other, seed)
+    photo, mask, tile, normal = disturbed(family, severity, maps, other, seed)
     true = enlarged(maps.albedo, tile, tile)
     if family == "uniform":
         true = true.mean((0, 1)) + severity * (true - true.mean((0, 1)))
@@ -185,7 +186,15 @@ def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: in
         region = Region("region", mask)
         material = palette.extract_material(photo, region, settings, lambda fraction, message: None, focal=FOCAL)
         warnings = [w for w in material.warnings if family == "slanted" or not w.startswith(SLANT)]
-        row |= judged(material.svbrdf.albedo, true, target)
+        albedo = material.svbrdf.albedo
+        if "homography" in material.rectification and normal is not None and albedo.ndim == 3:
+            # rectified, texels are of another size
+            homography = np.array(material.rectification["homography"])
+            size = material.exemplar.shape[:2]
+            found = rectification.Rectification(np.zeros((*size, 3)), np.ones(size, bool), homography)
+            scale = scale_of(found, Slanted(photo, mask, normal, FOCAL, 1.0, True))
+            albedo = resize(albedo, (max(8, round(RESOLUTION * scale)),) * 2)
+        row |= judged(albedo, true, target)
         row |= {"warned": bool(warnings), "warnings": "; ".join(re.sub(r"\d+", "#", w) for w in material.warnings)}
         shown.append(srgb_from_linear(np.clip(material.svbrdf.albedo, 0, 1)))
     except PaletteError as error:
