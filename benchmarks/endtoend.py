@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT))
 import dev  # noqa: E402
 
 dev.load_package()
-from material_palette.benchmarks import charts, records, scenes, svbrdf  # noqa: E402
+from material_palette.benchmarks import charts, measures, records, scenes, svbrdf  # noqa: E402
 from material_palette.benchmarks.baselines import largest_square  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
 from material_palette.benchmarks.zero_shot import ZeroShot  # noqa: E402
@@ -227,14 +227,6 @@ def pictures(maps: SVBRDF, scale: float) -> list[np.ndarray]:
     return found
 
 
-def crop(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """SIDE x SIDE px of a picture that wraps, from a place in 0 to 1."""
-    h, w = picture.shape[:2]
-    y, x = (where * (h, w)).astype(int)
-    local = np.arange(SIDE)
-    return picture[np.ix_((y + local) % h, (x + local) % w)]
-
-
 def tilt(maps: SVBRDF) -> float:
     """Mean angle in degrees between normals and the surface's own."""
     z = np.asarray(maps.normal, np.float32)[..., 2]
@@ -253,7 +245,8 @@ def compare(truth: SVBRDF, tile: float, found: Found, seed: int) -> dict[str, fl
     row = {}
     places = random.random((PAIRS, 2, 2))
     for name, first, second in zip("ANR", theirs, ours, strict=True):
-        row[name] = float(np.mean([perceptual.distance(crop(first, a), crop(second, b)) for a, b in places]))
+        pairs = [(measures.window(first, a, SIDE), measures.window(second, b, SIDE)) for a, b in places]
+        row[name] = float(np.mean([perceptual.distance(*pair) for pair in pairs]))
     lab = [svbrdf.cielab(mean_colour(m).reshape(1, 1, 3))[0, 0] for m in (truth, found.maps)]
     row["colour"] = float(svbrdf.ciede2000(*lab))
     row["roughness"] = float(abs(np.mean(truth.roughness) - np.mean(found.maps.roughness)))

@@ -197,12 +197,16 @@ def scale_of(found: rectification.Rectification, photo: Slanted) -> float:
     return np.sqrt(abs(np.linalg.det(to_plane)) / abs(bottom) ** 3) * photo.focal * photo.density
 
 
+def synthesised(found: rectification.Rectification, size: int) -> np.ndarray:
+    """The texture (size, size, 3), sRGB-encoded, that is made of an exemplar."""
+    exemplar = cut_exemplar(found.pixels, found.mask)
+    concept = patch.learn(srgb_from_linear(np.clip(exemplar.pixels, 0, 1)), exemplar.mask, _quiet)
+    return patch.sample(concept, (size, size), 0, _quiet, "draft").pixels
+
+
 def swd_to_flat(found: rectification.Rectification, scale: float, texture: Texture, size: int = 256) -> float:
     """Patch SWD of the texture synthesised from an exemplar to the true flat one, at `scale` texture px per texel."""
-    exemplar = cut_exemplar(found.pixels, found.mask)
-    encoded = srgb_from_linear(np.clip(exemplar.pixels, 0, 1))
-    concept = patch.learn(encoded, exemplar.mask, _quiet)
-    made = patch.sample(concept, (size, size), 0, _quiet, "draft").pixels
+    made = synthesised(found, size)
     tiled = np.tile(texture.pixels, (2, 2, 1))
     w, h = (max(64, round(n / scale)) for n in tiled.shape[1::-1])
     shrink = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
@@ -238,26 +242,17 @@ def judge_floor(photo: Slanted, texture: Texture, full: bool) -> dict:
     found = rectification.resample(photo.pixels, photo.mask, to_photo)
     result = {"cpu_seconds": time.process_time() - start, "megapixels": photo.mask.sum() / 1e6}
     if full:
-        random = np.random.default_rng(0)
-        places = random.random((4, 2, 2))
+        places = np.random.default_rng(0).random((4, 2, 2))
+        flat = resize(texture.pixels, tuple(round(n / photo.density) for n in texture.pixels.shape[:2]))
+        flat = srgb_from_linear(np.clip(flat, 0, 1))
         for name, one in (("before", rectification.Rectification(photo.pixels, photo.mask)), ("after", found)):
             scale = scale_of(one, photo) / photo.density  # px seen from the front per texel
-            exemplar = cut_exemplar(one.pixels, one.mask)
-            concept = patch.learn(srgb_from_linear(np.clip(exemplar.pixels, 0, 1)), exemplar.mask, _quiet)
-            made = resize(patch.sample(concept, (MADE, MADE), 0, _quiet, "draft").pixels, (round(MADE * scale),) * 2)
-            flat = resize(texture.pixels, tuple(round(n / photo.density) for n in texture.pixels.shape[:2]))
-            flat = srgb_from_linear(np.clip(flat, 0, 1))
+            made = resize(synthesised(one, MADE), (round(MADE * scale),) * 2)
             made = np.clip(made + (flat.mean((0, 1)) - made.mean((0, 1))), 0, 1)  # the colour is not at stake
-            pairs = [[_window(x, at) for x, at in zip((flat, made), both, strict=True)] for both in places]
+            pairs = [[measures.window(x, at, COMPARED) for x, at in zip((flat, made), p, strict=True)] for p in places]
             result[f"lpips_{name}"] = float(np.mean([perceptual.distance(*pair) for pair in pairs]))
             result[f"scale_{name}"] = 1 / scale
     return result
-
-
-def _window(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """COMPARED x COMPARED px of a picture (h, w, 3) that wraps, from a place in 0 to 1."""
-    rows, columns = ((int(a * n) + np.arange(COMPARED)) % n for a, n in zip(at, picture.shape, strict=False))
-    return np.ascontiguousarray(picture[np.ix_(rows, columns)], np.float32)
 
 
 # ---------------------------------------------------------------- curved

@@ -47,6 +47,14 @@ def patch_quantiles(pixels: np.ndarray, mask: np.ndarray | None = None) -> list[
     return result
 
 
+def window(picture: np.ndarray, at: np.ndarray, side: int) -> np.ndarray:
+    """side x side px of a picture (h, w, C) that wraps, from a place (2,) in 0 to 1."""
+    h, w = picture.shape[:2]
+    y, x = (at * (h, w)).astype(int)
+    local = np.arange(side)
+    return picture[np.ix_((y + local) % h, (x + local) % w)]
+
+
 def sliced_wasserstein(first: list, second: list) -> float:
     """Mean over scales and directions of the Wasserstein-1 distance of the projected patches, in encoded units.
 

@@ -170,6 +170,17 @@ def judged(albedo: np.ndarray, truth: np.ndarray, target: list) -> dict:
     return {"error": error, "colour": float(svbrdf.ciede2000(*lab))}
 
 
+def at_one_scale(material: palette.Material, seen: Slanted) -> np.ndarray:
+    """The base colour with texels as large as a px of what is seen from the front; rectified, they have other sizes."""
+    albedo = material.svbrdf.albedo
+    if seen.normal is None or "homography" not in material.rectification or albedo.ndim == 1:
+        return albedo
+    size = material.exemplar.shape[:2]
+    homography = np.array(material.rectification["homography"])
+    found = rectification.Rectification(seen.pixels, np.ones(size, bool), homography)
+    return resize(albedo, (max(8, round(RESOLUTION * scale_of(found, seen))),) * 2)
+
+
 def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: int, picture: Path | None) -> list[dict]:
     """The rows of both methods."""
     torch.set_num_threads(1)
@@ -186,15 +197,8 @@ def run_case(family: str, severity: float, maps: SVBRDF, other: SVBRDF, seed: in
         region = Region("region", mask)
         material = palette.extract_material(photo, region, settings, lambda fraction, message: None, focal=FOCAL)
         warnings = [w for w in material.warnings if family == "slanted" or not w.startswith(SLANT)]
-        albedo = material.svbrdf.albedo
-        if "homography" in material.rectification and normal is not None and albedo.ndim == 3:
-            # rectified, texels are of another size
-            homography = np.array(material.rectification["homography"])
-            size = material.exemplar.shape[:2]
-            found = rectification.Rectification(np.zeros((*size, 3)), np.ones(size, bool), homography)
-            scale = scale_of(found, Slanted(photo, mask, normal, FOCAL, 1.0, True))
-            albedo = resize(albedo, (max(8, round(RESOLUTION * scale)),) * 2)
-        row |= judged(albedo, true, target)
+        seen = Slanted(photo, mask, normal, FOCAL, 1.0, True)
+        row |= judged(at_one_scale(material, seen), true, target)
         row |= {"warned": bool(warnings), "warnings": "; ".join(re.sub(r"\d+", "#", w) for w in material.warnings)}
         shown.append(srgb_from_linear(np.clip(material.svbrdf.albedo, 0, 1)))
     except PaletteError as error:

@@ -151,31 +151,32 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
     filled from around them: left out they would take every patch that holds one with them; in others with a channel at
     its end there is texture yet. A joint or a hole may be black; a black area is a failure.
     """
-    ends = pixels >= white(pixels, mask)
-    for what, lost in (("over-exposed", ends.any(-1)), ("under-exposed", (pixels <= BLACK).all(-1))):
-        lost &= mask
-        speck = SPECK if what == "over-exposed" else HOLE
-        area = cv2.morphologyEx(lost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((speck, speck), np.uint8)) > 0
-        share = area.sum() / mask.sum()
-        if share:
-            left = _less(mask, _widened(area))
-            if left is mask:
-                warnings.append(f"{share:.0%} of the region is {what}; too little would be left without it: it is kept")
-            elif share > LEAST_SAID:
-                warnings.append(f"{share:.0%} of the region is {what} and left out")
-            mask = left
-        if what == "under-exposed":
-            continue
-        specks = mask & ends.any(-1) & ~_widened(area)
-        if specks.any():
-            around = masked_blur(pixels, mask & ~ends.any(-1), SPECK)
-            glare = (pixels > GLARE * around).any(-1)
-            specks &= glare | (pixels.min(-1) > PLAIN)
-            share = specks.sum() / mask.sum()
-            if share > LEAST_SAID:
-                warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")
-            pixels = _filled(pixels, mask, mask & _widened(specks))
-    return pixels, mask
+    ends, black = pixels >= white(pixels, mask), (pixels <= BLACK).all(-1)
+    clipped = ends.any(-1)
+    mask, area = _without_area(mask, clipped, SPECK, "over-exposed", warnings)
+    specks = mask & clipped & ~_widened(area)
+    if specks.any():
+        glare = (pixels > GLARE * masked_blur(pixels, mask & ~clipped, SPECK)).any(-1)
+        specks &= glare | (pixels.min(-1) > PLAIN)
+        share = specks.sum() / mask.sum()
+        if share > LEAST_SAID:
+            warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")
+        pixels = _filled(pixels, mask, mask & _widened(specks))
+    return pixels, _without_area(mask, black, HOLE, "under-exposed", warnings)[0]
+
+
+def _without_area(
+    mask: np.ndarray, lost: np.ndarray, side: int, what: str, warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mask without what is lost in squares of `side` px at least, where enough is left, and these (h, w) bool."""
+    area = cv2.morphologyEx((mask & lost).astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+    share = area.sum() / mask.sum()
+    left = _less(mask, _widened(area)) if share else mask
+    if share and left is mask:
+        warnings.append(f"{share:.0%} of the region is {what}; too little would be left without it: it is kept")
+    elif share > LEAST_SAID:
+        warnings.append(f"{share:.0%} of the region is {what} and left out")
+    return left, area
 
 
 def _filled(pixels: np.ndarray, mask: np.ndarray, lost: np.ndarray) -> np.ndarray:
