@@ -255,6 +255,59 @@ def judge_floor(photo: Slanted, texture: Texture, full: bool) -> dict:
     return result
 
 
+# ---------------------------------------------------------------- rooms
+
+
+def courses(random: np.random.Generator, side: int = 640) -> np.ndarray:
+    """Blocks in courses (side, side, 3) float32 linear, which tile: what walls have besides a texture."""
+    height, width = side // 10, side // 5
+    picture = np.full((side, side), 0.3, np.float32) * np.exp(random.normal(0, 0.1, (side, side))).astype(np.float32)
+    for row in range(10):
+        top, shift = row * height, row % 2 * width // 2
+        picture[top : top + 6] = 0.1
+        for column in range(5):
+            picture[top : top + height, (column * width + shift) % side :][:, :6] = 0.1
+    return np.repeat(picture[..., None], 3, 2)
+
+
+def room(texture: Texture, pitch: float, random: np.random.Generator, side: int) -> Slanted:
+    """A photo of the floor in the corner of a room whose walls are of blocks; the camera looks down by some degrees.
+    The mask is the floor; the focal length is not known."""
+    focal, turn, yaw = side * random.uniform(0.7, 1.2), random.uniform(0, 2 * np.pi), random.uniform(0.4, 1.17)
+    density = random.uniform(1.5, 3) * min(texture.pixels.shape[:2]) / 640
+    c, s = np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
+    down = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    normals = down @ np.array([[0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)], [-np.cos(yaw), 0, np.sin(yaw)]]).T
+    grid = (np.arange(side) - (side - 1) / 2) / focal
+    rays = np.stack(np.meshgrid(grid, grid) + [np.ones((side, side))], -1)
+    inverse = rays @ (normals / normals[2])
+    # the walls meet in the middle, the floor begins up to 15 % of the side below it
+    inverse[..., 0] *= (inverse[..., 1:].max(-1) / inverse[..., 0])[int(side * random.uniform(0.5, 0.65)), side // 2]
+    nearest = inverse.argmax(-1)
+    photo = np.zeros((side, side, 3), np.float32)
+    for i, (pixels, px) in enumerate([(texture.pixels, density), (courses(random), 2.0), (courses(random), 2.0)]):
+        # courses run along the floor
+        right, below = plane_axes(normals[:, i]) @ np.cross(normals[:, 0], normals[:, i])
+        along = np.arctan2(below, right) if i else turn
+        seen, _ = photograph(pixels, normals[:, i], focal, (side, side), px, along, random)
+        photo[nearest == i] = seen[nearest == i]
+    return Slanted(photo, nearest == 0, normals[:, 0], focal, density, False)
+
+
+def judge_room(photo: Slanted, texture: Texture, full: bool) -> dict:
+    """The floor's plane by its own texture alone, and by the frame of the photo's lines too."""
+    start = time.process_time()
+    view, result = rectification.look(photo.pixels), {}
+    framed = view.frame
+    for name, view.frame in (("before", None), ("after", framed)):
+        found = rectification.rectify(photo.pixels, photo.mask, view)
+        claimed = found.homography is not None
+        error = float(np.degrees(np.arccos(np.clip(-found.normal @ photo.normal, -1, 1)))) if claimed else ""
+        result |= {f"normal_error_{name}": error, f"claimed_{name}": float(claimed)}
+        result[f"false_{name}"] = float(claimed and error > FALSE)
+    return result | {"cpu_seconds": time.process_time() - start, "megapixels": photo.mask.sum() / 1e6}
+
+
 # ---------------------------------------------------------------- curved
 
 
@@ -340,6 +393,7 @@ def _quiet(fraction: float, message: str) -> None:
     pass
 
 
+SHARES = ("claimed", "false", "flattened", "shadow", "changed")
 SLANTS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 75.0)
 SLANT_CURVES = (
     ("normal_error", "error of the normal, degrees"),
@@ -361,6 +415,13 @@ FAMILIES = {
         floor,
         judge_floor,
         (("lpips", "ST-LPIPS to the flat texture"), ("scale", "texels per px seen from the front")),
+    ),
+    "room": Family(
+        "degrees that the camera looks down; floor of a room",
+        (5.0, 10.0, 20.0, 30.0, 40.0),
+        room,
+        judge_room,
+        (("normal_error", "error of the normal, degrees"), ("claimed", "share rectified")),
     ),
     "curved": Family(
         "half-angle seen of a column, degrees",
@@ -447,7 +508,7 @@ def summarise(rows: list[dict]) -> dict:
         for measure in own[0].keys() - {"family", "severity", "texture", "kind"}:
             values = [float(row[measure]) for row in own if row.get(measure) not in ("", None)]
             if values:
-                share = measure in ("claimed", "false", "flattened", "shadow", "changed")
+                share = measure.removesuffix("_before").removesuffix("_after") in SHARES
                 entry[measure] = float(f"{(np.mean if share else np.median)(values):.4g}")
         summary.setdefault(family, {}).setdefault(kind, {})[f"{severity:g}"] = dict(sorted(entry.items()))
     return summary

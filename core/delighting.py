@@ -25,6 +25,7 @@ import numpy as np
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec.709
 DARKEST = 1e-3  # linear; keeps the logarithm of black finite
+SAMPLED = 250_000  # px that a mean is taken of, at least
 GRID = 192  # px: longest side of the grid on which light is looked for
 BLOCKS = 8  # along a side of the square with the region's area, whose means are compared
 LEAST_BLOCK = 12.0  # px
@@ -58,8 +59,8 @@ LEAST_WIDE = 84  # px: side of the square with the area of a region that shows e
 class Light:
     """What falls on a region.
 
-    shading (h, w, 3) float32 > 0, of which cast (h, w, 3) is the cast shadow's part; unsure (h, w) bool, the border of
-    a shadow, where it isn't known well; shaded, the share of the region in a cast shadow.
+    shading (h, w, 3) float32 > 0; cast (h, w, 3): the cast shadow's part of it, 1 where it is lit; unsure (h, w) bool,
+    the border of a shadow, where it isn't known well; shaded, the share of the region in a cast shadow.
     """
 
     shading: np.ndarray
@@ -71,9 +72,9 @@ class Light:
 def find_light(
     pixels: np.ndarray, mask: np.ndarray, progress: Callable[[float], None] = lambda fraction: None
 ) -> Light:
-    """The illumination of pixels (h, w, 3) float32 linear within mask (h, w) bool.
+    """The illumination of pixels (h, w, 3) float32 linear within mask (h, w) bool, of geometric mean 1 over the region.
 
-    Slow changes have a geometric mean of 1 over the region; a cast shadow is less than 1, its lit side 1.
+    That holds with a cast shadow, too: the lit side is above 1, for the photo was exposed for both.
     """
     h, w = mask.shape
     x = np.log(np.maximum(pixels, DARKEST))
@@ -100,7 +101,8 @@ def find_light(
         texture = (x - whole - cast_there)[mask]
         left = _left(rest, inside, float(texture.var(0).sum()))
         whole += cv2.resize(left, (w, h), interpolation=cv2.INTER_LINEAR)
-    return Light(np.exp(whole + cast_there), np.exp(cast_there), unsure, shaded)
+    whole += cast_there - cast_there[mask].mean(0)
+    return Light(np.exp(whole), np.exp(cast_there), unsure, shaded)
 
 
 def _unbalanced(rest: np.ndarray, inside: np.ndarray, shadow: "_Border") -> np.ndarray:
@@ -124,6 +126,12 @@ def reduce_to_grid(x: np.ndarray, mask: np.ndarray, most: int = GRID) -> tuple[n
     value = cv2.resize(np.where(mask[..., None], x, 0), size, interpolation=cv2.INTER_AREA)
     inside = weight > min(0.5, 0.9 * float(weight.max()))
     return np.where(inside[..., None], value / np.maximum(weight, 1e-6)[..., None], 0), inside, scale
+
+
+def log_mean(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(3,) mean logarithm of pixels (h, w, 3) linear over mask (h, w) bool, of a large one over every so many-th."""
+    some = slice(None, None, max(1, int(np.sqrt(mask.sum() / SAMPLED))))
+    return np.log(np.maximum(pixels[some, some][mask[some, some]], DARKEST)).mean(0)
 
 
 def masked_blur(x: np.ndarray, inside: np.ndarray, sigma: float) -> np.ndarray:

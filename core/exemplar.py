@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from .delighting import LUMINANCE as LUMINANCE
-from .delighting import find_light, masked_blur
+from .delighting import find_light, log_mean, masked_blur
 from .errors import PaletteError
 from .image import srgb_from_linear
 from .outliers import find_foreign
@@ -20,6 +20,7 @@ GRAIN = 2.5  # times what white noise leaves after blurring is more than noise
 WHITE_BALANCES = ("off", "region", "card")
 GREY_CARD = 0.18  # reflectance of what photographers hold into the light
 UNEVEN = 0.3  # deviation over mean of a card's luminance; what varies more shows something else too
+BRIGHTEST = 0.99  # share of a region's pixels that its level must not bring above white
 CLIPPED = 0.98  # linear; above it the camera saw white
 PLAIN = 0.8  # linear: of a channel's least in plain white, where another one is clipped
 GLARE = 2.0  # times what is around it: a speck that is brighter is light or noise, no texture
@@ -39,9 +40,9 @@ class Exemplar:
     """The region cut out of the photo.
 
     pixels (h, w, 3) float32 linear, evenly lit; mask (h, w) bool, what of the region is fit to learn from; shading
-    (h, w, 3) float32 > 0, the illumination that was divided out: pixels * shading is the photo. Its slow part has a
-    geometric mean of 1 over the region, a cast shadow is below 1. uniform: the median (3,) of a region of one colour,
-    else None.
+    (h, w, 3) float32 > 0, the illumination that was divided out: pixels * shading is the photo. Where no grey card or
+    balance tells the light its geometric mean is 1 over the whole surface. uniform: the median (3,) of a region of one
+    colour, else None.
     """
 
     pixels: np.ndarray
@@ -62,6 +63,7 @@ def cut_exemplar(
     flatten: bool = True,
     white_balance: str | np.ndarray = "off",
     progress: Callable[[float, str], None] = lambda fraction, message: None,
+    level: float = 1.0,
 ) -> Exemplar:
     """Cut a region out of a photo, leave out what isn't fit to learn from, and flatten its illumination.
 
@@ -69,7 +71,9 @@ def cut_exemplar(
     bright or too dark for the camera), another material at the region's border and the borders of cast shadows. Of a
     region that spreads wider than LARGEST the fullest part is cut. With white_balance "region" the colour of the light
     is taken from the region, whose mean is taken to be grey: for plaster, concrete, snow. White_balance (3,) is what
-    the photo shows of a grey card: then brightness and colour of the light are known.
+    the photo shows of a grey card: then brightness and colour of the light are known. level: how many times as bright
+    as these pixels the surface is of which they are a part, such as a box's one side, in the geometric mean: without a
+    grey card that is the best guess of the light.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -79,7 +83,11 @@ def cut_exemplar(
         box = _fullest(mask, box)
         warnings.append(f"the region spreads over {w} x {h} px; the fullest {LARGEST} x {LARGEST} px of it are used")
     pixels, mask = np.ascontiguousarray(pixels[box]), np.ascontiguousarray(mask[box])
+    seen = mask & (pixels > BLACK).any(-1)
+    before = log_mean(pixels, seen) if seen.any() else 0
     pixels, mask = _without_colourless(pixels, mask, warnings)
+    # what the camera saw as white is as bright as that at least
+    level *= float(np.exp((before - log_mean(pixels, mask)) @ LUMINANCE)) if seen.any() else 1.0
     shading = np.ones_like(pixels)
     if flatten:
         light = find_light(pixels, mask, lambda fraction: progress(0.4 * fraction, "evening the light"))
@@ -102,6 +110,10 @@ def cut_exemplar(
     elif white_balance == "region":
         mean = (pixels / shading)[mask].mean(0)
         shading = shading * (mean / max(float(mean @ LUMINANCE), 1e-6)).clip(1e-3)
+    if flatten and level != 1 and not isinstance(white_balance, np.ndarray):
+        # nothing reflects more light than falls on it
+        brightest = float(np.quantile((pixels / shading)[mask].max(-1), BRIGHTEST))
+        shading = shading / np.float32(min(level, max(1.0, 1 / max(brightest, 1e-6))))
     pixels = pixels / shading
     progress(1.0, "evening the light")
     uniform = _uniform_colour(pixels, mask)

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from . import brdf, decomposition, engines, front, rectification, reduction, sheet
+from .delighting import LUMINANCE, log_mean
 from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
 from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar
@@ -27,7 +28,7 @@ from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
 from .perceptual import Crops
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
-from .sides import largest_side
+from .sides import largest_side, same_hue
 from .tensors import read_tensors, write_tensors
 from .torus import resize
 
@@ -516,25 +517,31 @@ def preview_exemplar(
 def _exemplar(flat: rectification.Rectification, settings: Settings, progress: Progress) -> Exemplar:
     progress(0.0, "cutting the exemplar")
     balance = np.float32(settings.grey_card) if settings.white_balance == "card" else settings.white_balance
-    return cut_exemplar(flat.pixels, flat.mask, settings.flatten, balance, progress)
+    return cut_exemplar(flat.pixels, flat.mask, settings.flatten, balance, progress, flat.level)
 
 
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
     """The region seen from the front, or as it is; of a region on a solid's several sides the largest."""
-    mask, warnings = region.mask, []
+    mask, whole, warnings = region.mask, region.mask, []
     if settings.flatten and region.corners is None:
         progress(0.0, "looking for the sides of the region")
         mask = largest_side(pixels, mask)
         share = 1 - mask.sum() / region.mask.sum()
         if share:
             warnings.append(f"{share:.0%} of the region, on another side or in another light, is left out")
+            whole = whole if same_hue(pixels, mask, whole & ~mask) else mask
     if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
-        return rectification.Rectification(pixels, mask, warnings=warnings)
-    progress(0.1, "rectifying")
-    if region.corners is not None:
-        return rectification.rectify_corners(pixels, mask, region.corners, focal)
-    flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
+        flat = rectification.Rectification(pixels, mask)
+    else:
+        progress(0.1, "rectifying")
+        if region.corners is not None:
+            flat = rectification.rectify_corners(pixels, mask, region.corners, focal)
+        else:
+            flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
     flat.warnings[:0] = warnings
+    if flat.mask is not whole:
+        change = log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask)
+        flat.level = float(np.exp(change @ LUMINANCE))
     return flat
 
 

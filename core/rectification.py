@@ -1,9 +1,10 @@
 """Rectification: a region of a slanted plane, resampled as if the camera had faced it.
 
-The plane comes from the user's four corners, from a camera and an object, or is found: of all planes the one under
-which the texture's local spectra agree (`texture_gradient`) and straight lines run in few directions (`vanishing`).
-Where the spectra agree better on a round surface, that is unrolled (`cylinder`). Where nothing says enough, the region
-stays as it is.
+The plane comes from the user's four corners, from a camera and an object, or is found: of the three planes that the
+lines of the whole photo follow, since what people build stands in one frame, the one under which the texture's local
+spectra agree (`texture_gradient`); where none of them will do, of all planes the one under which the spectra agree and
+the region's own lines run in few directions (`vanishing`). Where the spectra agree better on a round surface, that is
+unrolled (`cylinder`). Where nothing says enough, the region stays as it is.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from .errors import PaletteError
 from .exemplar import CLIPPED, LARGEST, LUMINANCE
 from .image import srgb_from_linear
 from .texture_gradient import Spectra, gradient_scores, local_spectra, plane_axes
-from .vanishing import Segments, find_focal, find_frame, find_segments, line_score
+from .vanishing import Frame, Segments, find_focal, find_frame, find_segments, line_score
 
 MODES = ("off", "auto", "quad")
 DEFAULT_FOCAL = 1.0  # in longer sides of the photo: 53 degrees, between a telephone's camera and a normal lens
@@ -28,6 +29,12 @@ LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middl
 AXIS = np.array([0.0, 0.0, 1.0])
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
 ENOUGH_LINES = 100
+ENOUGH_WINDOWS = 20  # to tell any plane; a plane of the photo's frame needs no more than make spectra
+# of the photo's frame: share of the length of its longest lines that follow it, and its second direction, without which
+# it may lie anyhow around the first; gain of one of its planes over the front with any part of the region left out, and
+# over its other planes
+LONGEST_LINES, LEAST_FOLLOWED, LEAST_SECOND = 250, 0.5, 0.06
+LEAST_FRAMED, LEAST_AHEAD = 0.03, 0.03
 LEAST_CONFIDENCE = 0.5
 SUSPECTED = 0.05  # confidence from which on a slant that was not told for certain is worth a warning
 # of a texel's density in the photo, in the worst direction
@@ -42,11 +49,13 @@ DARKEST = 1e-3
 
 @dataclass
 class View:
-    """What a photo tells about its camera: focal length in px, whether it is known, the straight segments."""
+    """What a photo tells about its camera: focal length in px, whether it is known, the straight segments, and the
+    frame that these follow, where they do."""
 
     focal: float
     known: bool
     segments: Segments
+    frame: Frame | None = None
 
 
 @dataclass
@@ -57,7 +66,7 @@ class Rectification:
     the region was left as it is or unrolled: then cylinder is in photo px, and to_surface (2, 3) goes from its px to
     the surface laid flat; method: "off", "corners", "auto", "plane" or "cylinder"; normal (3,): unit, towards the
     camera, camera coordinates (x right, y down, z forward), None when not known; slant in degrees between it and the
-    optical axis; confidence 0 to 1.
+    optical axis; confidence 0 to 1; level as `cut_exemplar` takes it.
     """
 
     pixels: np.ndarray
@@ -69,6 +78,7 @@ class Rectification:
     warnings: list[str] = field(default_factory=list)
     cylinder: Cylinder | None = None
     to_surface: np.ndarray | None = None
+    level: float = 1.0
 
     @property
     def slant(self) -> float | None:
@@ -106,12 +116,13 @@ class PlaneEstimate:
 
 
 def look(pixels: np.ndarray, focal: float | None = None) -> View:
-    """Find a photo's segments and, unless it is given in px, its focal length. pixels (H, W, 3) float32 linear."""
-    segments = find_segments(srgb_from_linear(np.clip(pixels @ LUMINANCE, 0, 1)))
-    if focal is not None:
-        return View(float(focal), True, segments)
-    found = find_focal(segments, pixels.shape[:2])
-    return View(found or DEFAULT_FOCAL * max(pixels.shape[:2]), found is not None, segments)
+    """Find a photo's segments, their frame and, unless it is given in px, its focal length. pixels (H, W, 3) linear."""
+    segments, shape = find_segments(srgb_from_linear(np.clip(pixels @ LUMINANCE, 0, 1))), pixels.shape[:2]
+    known = focal or find_focal(segments, shape)
+    focal = float(known or DEFAULT_FOCAL * max(shape))
+    frame = find_frame(Segments(segments.ends[:LONGEST_LINES]), focal, _principal_point(shape), all_three=True)
+    sure = frame is not None and frame.share >= LEAST_FOLLOWED and frame.balance >= LEAST_SECOND
+    return View(focal, known is not None, segments, frame if sure else None)
 
 
 def rectify_corners(
@@ -275,15 +286,17 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     centre = np.array(_principal_point(mask.shape))
     own = ((centre - (box[1].start, box[0].start)) + 0.5) * scale - 0.5
     spectra = local_spectra(np.log(grey + DARKEST), small, view.focal * scale, tuple(own))
-    inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    segments = view.segments.within(inside)
-    enough = min(len(segments.ends), ENOUGH_LINES) / ENOUGH_LINES
-    frame = find_frame(segments, view.focal, tuple(centre))
     if spectra is None:
         return None
     ray = np.append(spectra.at.mean(0), 1.0)
     ray /= np.linalg.norm(ray)
-    starts = _starts(ray)
+    framed = _framed(spectra, view.frame, ray)
+    if framed is not None or len(spectra.at) < ENOUGH_WINDOWS:
+        return framed
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    segments = view.segments.within(inside)
+    enough = min(len(segments.ends), ENOUGH_LINES) / ENOUGH_LINES
+    starts, frame = _starts(ray), find_frame(segments, view.focal, tuple(centre))
     if frame is not None:
         normal = frame.axes[2] * np.sign(frame.axes[2] @ ray)
         starts += [normal] if normal @ ray > LEAST_FACING else []
@@ -311,6 +324,32 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     return PlaneEstimate(planes[best], _confidence(evidence), evidence, spectra)
 
 
+def _framed(spectra: Spectra, frame: Frame | None, ray: np.ndarray) -> PlaneEstimate | None:
+    """Of a photo's frame the plane that explains the texture better than its others and, with any part of the region
+    left out, better than the front; None where none does. ray (3,): to the middle of the region."""
+    front = gradient_scores(spectra, AXIS)
+    found = []
+    for axis in () if frame is None else frame.axes:
+        normal = axis * np.sign(axis @ ray)
+        scores = gradient_scores(spectra, normal) if normal @ ray > LEAST_FACING else None
+        if scores is not None:
+            found.append((float(scores[0] - front[0]), float((scores - front).min()), normal))
+    found.sort(key=lambda plane: -plane[0])
+    if not found or found[0][1] < LEAST_FRAMED or _between(found[0][2], AXIS) < LEAST_SLANT:
+        return None
+    gain, least, normal = found[0]
+    margin = gain - found[1][0] if len(found) > 1 else 1.0
+    if margin < LEAST_AHEAD:
+        return None
+    evidence = {"gain": gain, "least_gain": least, "margin": margin, "windows": len(spectra.at)}
+    return PlaneEstimate(normal, _certainty(min(least / LEAST_FRAMED, margin / LEAST_AHEAD)), evidence, spectra)
+
+
+def _certainty(times: float) -> float:
+    """0.5 for evidence that just suffices, which is 1 times what is asked for."""
+    return float(1 / (1 + np.exp(-3 * np.log(max(times, 1e-6)))))
+
+
 def _confidence(evidence: dict[str, float]) -> float:
     """Of a slanted plane: 0.5 where the weakest of what speaks for it just suffices.
 
@@ -322,7 +361,7 @@ def _confidence(evidence: dict[str, float]) -> float:
     weakest = min(
         evidence["gain"] / LEAST_GAIN, evidence["margin"] / margin, MOST_SPREAD / max(evidence["spread"], 0.1)
     )
-    return float(1 / (1 + np.exp(-3 * np.log(max(weakest, 1e-6)))))
+    return _certainty(weakest)
 
 
 def _starts(ray: np.ndarray) -> list[np.ndarray]:

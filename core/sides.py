@@ -12,7 +12,7 @@ Sources: Canny 1986 (crests of the gradient), Duda and Hart 1972 (lines by their
 import cv2
 import numpy as np
 
-from .delighting import DARKEST, LEAST_WIDE, LUMINANCE, fit, masked_blur, polynomial, reduce_to_grid
+from .delighting import DARKEST, LEAST_WIDE, LUMINANCE, fit, log_mean, masked_blur, polynomial, reduce_to_grid
 from .exemplar import PATCH, white
 
 CELLS = 112  # longest side of the grid on which is looked
@@ -30,7 +30,14 @@ SERIES, PARALLEL = 3, 12.0
 LONGER = 0.6  # of its length, that a line may go on at each end until it meets another or leaves the region
 APART = 3.0  # deviations of the slow changes within the side that is kept, by which another one differs
 LEAST_SHARE = 0.25  # of the region, that is kept; what falls into smaller parts is one surface
+MOST_HUE = 0.3  # of log R/G and log B/G, that two lights make
 LEAST_LOST = 0.02  # of the region; less harms nobody
+
+
+def same_hue(pixels: np.ndarray, first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two parts (H, W) bool of a photo (H, W, 3) float32 linear may be one paint in two lights."""
+    change = log_mean(pixels, first) - log_mean(pixels, second)
+    return float(np.hypot(change[0] - change[1], change[2] - change[1])) < MOST_HUE
 
 
 def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:

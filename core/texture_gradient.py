@@ -21,7 +21,7 @@ import numpy as np
 WINDOW = 64  # px
 HOP = 32
 LEAST_COVER = 0.85  # of a window by the region, weighted
-LEAST_WINDOWS = 20
+LEAST_WINDOWS = 10
 RADII, ANGLES = 8, 12  # of the frequencies that are read in a window
 LOWEST, HIGHEST = 2.5 / WINDOW, 0.3  # cycles per px
 OFFSETS = 4  # places of these frequencies, so that no plane is favoured because they fall on the bins' centres

@@ -47,8 +47,8 @@ class Segments:
 class Frame:
     """Directions that lines follow: axes (3, 3) rows orthonormal, camera coordinates (x right, y down, z forward).
 
-    share: of the line length that rows 0 and 1 explain (and row 2 where all_three); balance: the lesser of the shares
-    of rows 0 and 1; error: standard deviation of the plane's normal in degrees, from the least squares; focal in px.
+    share: of the line length that rows 0 and 1 explain (and row 2 where all_three); balance: the second largest
+    share of one row; error: standard deviation of the plane's normal in degrees, from the least squares; focal in px.
     """
 
     axes: np.ndarray
@@ -127,7 +127,7 @@ def find_frame(
     fits = np.stack([_fit(v[None], middle, unit, tolerance)[0] for v in axes[: 3 if all_three else 2]])
     shares = fits @ weight
     belongs = fits.argmax(0)
-    balance = min(float((fits[i] * (belongs == i)) @ weight) for i in (0, 1))
+    balance = sorted(float((fit * (belongs == i)) @ weight) for i, fit in enumerate(fits))[-2]
     return Frame(axes, float(fits.max(0) @ weight), balance, error, int((fits.max(0) > 0.5).sum()), focal)
 
 

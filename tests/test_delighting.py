@@ -48,6 +48,14 @@ def test_a_cast_shadow_is_balanced_in_every_channel(softness):
     assert any("% of the region lies in a cast shadow" in warning for warning in exemplar.warnings)
 
 
+def test_a_shadow_leaves_the_level_of_the_whole_region():
+    flat, lit = texture(), half()
+    photo = photographed(flat * under(lit))
+    light = find_light(photo, everywhere())
+    assert light.shaded > 0.3
+    assert np.abs(np.log(light.shading).mean((0, 1))).max() < 0.02
+
+
 def test_shadow_and_ramp_together_are_taken_out():
     flat, lit = texture(), half()
     ramp = np.linspace(1, 0.5, SIDE, dtype=np.float32)[:, None, None]

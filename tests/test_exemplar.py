@@ -38,9 +38,21 @@ def test_what_lies_outside_the_region_does_not_change_the_result():
     assert np.allclose(one.pixels[one.mask], two.pixels[two.mask], rtol=1e-4)
 
 
+def test_a_part_of_a_surface_gets_the_level_of_all_of_it():
+    pixels = linear_from_srgb(0.1 + 0.4 * pebbles(120, 120))
+    plain, brighter = (cut_exemplar(pixels, full(pixels), level=level) for level in (1.0, 1.5))
+    assert np.allclose(brighter.pixels, 1.5 * plain.pixels, rtol=1e-4)
+    assert np.allclose(brighter.pixels * brighter.shading, pixels, rtol=1e-4)
+    # no surface is brighter than white, and a grey card knows better
+    assert np.quantile(cut_exemplar(pixels, full(pixels), level=50.0).pixels.max(-1), 0.99) <= 1.001
+    card = np.float32([0.2, 0.2, 0.2])
+    beside = [cut_exemplar(pixels, full(pixels), white_balance=card, level=level).pixels for level in (1.0, 1.5)]
+    assert np.array_equal(*beside)
+
+
 def test_without_flattening_the_photo_is_kept():
     pixels = linear_from_srgb(pebbles(80, 80))
-    exemplar = cut_exemplar(pixels, full(pixels), flatten=False)
+    exemplar = cut_exemplar(pixels, full(pixels), flatten=False, level=2.0)
     assert np.array_equal(exemplar.pixels, pixels)
 
 

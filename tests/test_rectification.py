@@ -56,6 +56,56 @@ def test_the_plane_of_a_texture_is_found(texture):
     assert np.degrees(np.arccos(found.normal @ -normal)) < 8
 
 
+def room(floor_texture, turn=0.35, drop=0.3):
+    """A photo of a wall of bricks above a floor, its floor's mask, and the floor's normal away from the camera."""
+    c, s = np.cos(drop), np.sin(drop)
+    lower = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])  # the camera looks down a little
+    wall = lower @ np.array([np.sin(turn), 0, np.cos(turn)])
+    floor = lower @ np.array([0, 1.0, 0])
+    side, level = 384, 205
+    photo = slanted(bricks(), wall)
+    centre = ((side - 1) / 2,) * 2
+    to_photo = rectification.plane_to_photo(floor, FOCAL * side, centre, ((side - 1) / 2, 0.8 * side))
+    to_texture = np.diag([300.0, 300.0, 1.0]) @ np.linalg.inv(to_photo)
+    flat = cv2.warpPerspective(
+        floor_texture, to_texture, (side, side), flags=cv2.INTER_AREA | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_WRAP
+    )
+    mask = np.zeros((side, side), bool)
+    mask[level:] = True
+    photo[mask] = flat[mask]
+    return photo, mask, floor
+
+
+def test_a_floor_without_lines_is_found_by_the_lines_of_the_wall():
+    photo, mask, floor = room(pebbles(1024, 1024))
+    view = view_of(photo)
+    found = rectification.find_plane(photo, mask, view)
+    assert "least_gain" in found.evidence and found.confidence >= 0.5
+    assert np.degrees(np.arccos(found.normal @ floor)) < 5
+    assert rectification.rectify(photo, mask, view).method == "auto"
+
+
+def test_a_frame_that_the_texture_does_not_follow_is_no_plane_of_its():
+    photo, mask, floor = room(pebbles(1024, 1024))
+    facing, _, _ = room(pebbles(1024, 1024))
+    facing[mask] = pebbles(384, 384)[mask]
+    view = view_of(photo)
+    assert rectification.rectify(facing, mask, view).homography is None
+    # of no other plane of the frame, either
+    view.frame.axes = view.frame.axes[np.abs(view.frame.axes @ floor) < 0.9]
+    found = rectification.find_plane(photo, mask, view)
+    assert found is None or "least_gain" not in found.evidence
+
+
+def test_lines_that_all_run_one_way_make_no_frame():
+    pixels = slanted(bricks(), tilted(50, 1.2))
+    boards = pixels.copy()
+    boards[:] = pixels.mean()
+    boards[::24] = 0.05
+    assert view_of(boards).frame is None and view_of(pebbles(384, 384)).frame is None
+    assert view_of(slanted(bricks(), tilted(50, 0.3))).frame is not None
+
+
 def test_a_region_seen_from_the_front_stays_bit_for_bit():
     pixels, mask = pebbles(384, 384), np.ones((384, 384), bool)
     found = rectification.rectify(pixels, mask, view_of(pixels))

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core import palette
+from material_palette.core.image import linear_from_srgb
 from material_palette.core.region import Region
 from material_palette.core.sides import largest_side
-from textures import pebbles, tileable_noise
+from textures import pebbles, quiet, tileable_noise
 
 SIZE = 320
 BOX = {
@@ -113,10 +114,24 @@ def test_the_corner_of_a_house_is_said_and_can_be_kept():
 
     def preview(**settings):
         settings = palette.Settings(rectify="off", **settings)
-        return palette.preview_exemplar(pixels, region, settings, lambda fraction, message: None)
+        return palette.preview_exemplar(pixels, region, settings, quiet)
 
     picture, warnings = preview()
     assert len(warnings) == 1 and "on another side" in warnings[0] and 38 <= int(warnings[0].split("%")[0]) <= 42
     assert abs(picture.shape[1] - 168) < 6
+    # as bright as both sides together
+    assert np.log(linear_from_srgb(picture / 255)).mean() == pytest.approx(np.log(pixels[mask]).mean(), abs=0.02)
     picture, warnings = preview(flatten=False)
     assert picture.shape[1] == 280 and not any("another side" in warning for warning in warnings)
+
+
+def test_a_dado_of_another_paint_leaves_the_level_of_the_wall():
+    pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
+    mask[20:300, 20:300] = True
+    kept = mask & (np.arange(SIZE)[:, None] < 200)
+    pixels[200:] *= np.float32([1.5, 2.5, 3.5])
+    settings = palette.Settings(rectify="off")
+    picture, warnings = palette.preview_exemplar(pixels, Region("wall", mask), settings, quiet)
+    assert any("on another side" in warning for warning in warnings)
+    inside = picture[4:150, 4:-4]
+    assert np.log(linear_from_srgb(inside / 255)).mean() == pytest.approx(np.log(pixels[kept]).mean(), abs=0.05)
