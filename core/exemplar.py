@@ -28,6 +28,9 @@ BLACK = 4e-4  # linear; below it the camera saw black: 1 of 255 encoded
 PATCH = 7  # px: what an engine learns from at least
 LEAST_PATCHES = 400
 LEAST_LEFT = 0.2  # of the patches; with fewer left the exemplar would no longer stand for the region
+# px, and share of the side of the square with the region's area, that are left out at a region's borders; share of its
+# patches that this may cost
+RIM, RIM_SHARE, RIM_COST = 2, 0.005, 0.2
 SPECK, HOLE = 5, 9  # px: side of the least square of white or black that is left out; smaller ones belong to a texture
 LEAST_SAID = 0.01  # of the region
 # of `_sharpness`: 1 % of 89 photographed textures lie below it, and half of them after a blur of 2 px, all of 4 px
@@ -204,6 +207,20 @@ def _filled(pixels: np.ndarray, mask: np.ndarray, lost: np.ndarray) -> np.ndarra
     return pixels
 
 
+def without_rim(mask: np.ndarray) -> np.ndarray:
+    """The mask (H, W) bool without what lies at its borders, where lens and hand have mixed it with what is beside it;
+    itself where that would cost more than RIM_COST of its patches. The photo's edge is no border."""
+    reach = max(RIM, round(RIM_SHARE * float(np.sqrt(mask.sum()))))
+    left = cv2.erode(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    before, after = (_patches(m) for m in (mask, left))
+    return left if after > (1 - RIM_COST) * before else mask
+
+
+def _patches(mask: np.ndarray) -> int:
+    """How many patches lie in a mask, whose edge bounds them."""
+    return int(cv2.erode(np.pad(mask, 1).astype(np.uint8), np.ones((PATCH, PATCH), np.uint8)).sum())
+
+
 def _widened(lost: np.ndarray) -> np.ndarray:
     """With what is next to it, which has been mixed with it by the lens and the file's compression."""
     return cv2.dilate(lost.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -212,9 +229,7 @@ def _widened(lost: np.ndarray) -> np.ndarray:
 def _less(mask: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     """The mask without what is dropped; the mask itself where too few patches would be left to learn from."""
     left = mask & ~dropped
-    patch = np.ones((PATCH, PATCH), np.uint8)
-    before, after = (cv2.erode(np.pad(m, 1).astype(np.uint8), patch).sum() for m in (mask, left))
-    return left if after >= max(LEAST_PATCHES, LEAST_LEFT * before) else mask
+    return left if _patches(left) >= max(LEAST_PATCHES, LEAST_LEFT * _patches(mask)) else mask
 
 
 def _fullest(mask: np.ndarray, box: tuple[slice, slice]) -> tuple[slice, slice]:

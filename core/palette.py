@@ -23,7 +23,7 @@ from . import brdf, decomposition, engines, front, rectification, reduction, she
 from .delighting import LUMINANCE, log_mean
 from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
-from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar
+from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
 from .perceptual import Crops
@@ -522,14 +522,16 @@ def _exemplar(flat: rectification.Rectification, settings: Settings, progress: P
 
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
     """The region seen from the front, or as it is; of a region on a solid's several sides the largest."""
-    mask, whole, warnings = region.mask, region.mask, []
+    whole, warnings = region.mask, []
+    mask = without_rim(whole)
     if settings.flatten and region.corners is None:
         progress(0.0, "looking for the sides of the region")
-        mask = largest_side(pixels, mask)
-        share = 1 - mask.sum() / region.mask.sum()
-        if share:
+        side = largest_side(pixels, mask)
+        if side is not mask:
+            share = 1 - side.sum() / mask.sum()
             warnings.append(f"{share:.0%} of the region, on another side or in another light, is left out")
-            whole = whole if same_hue(pixels, mask, whole & ~mask) else mask
+            whole = whole if same_hue(pixels, side, mask & ~side) else side
+            mask = side
     if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
         flat = rectification.Rectification(pixels, mask)
     else:

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core.errors import PaletteError
-from material_palette.core.exemplar import _filled, card_colour, cut_exemplar
+from material_palette.core.exemplar import RIM, _filled, card_colour, cut_exemplar, without_rim
 from material_palette.core.image import linear_from_srgb, srgb_from_linear
 from textures import pebbles
 
@@ -48,6 +48,30 @@ def test_a_part_of_a_surface_gets_the_level_of_all_of_it():
     card = np.float32([0.2, 0.2, 0.2])
     beside = [cut_exemplar(pixels, full(pixels), white_balance=card, level=level).pixels for level in (1.0, 1.5)]
     assert np.array_equal(*beside)
+
+
+def test_the_rim_of_a_region_is_left_out_where_it_costs_little():
+    photo = np.zeros((300, 400), bool)
+    photo[:, 100:] = True
+    # the photo's edge is no border
+    assert np.array_equal(np.argwhere(photo & ~without_rim(photo))[:, 1], np.tile(100 + np.arange(RIM), 300))
+    thin = np.zeros((300, 400), bool)
+    thin[::20] = thin[1::20] = thin[2::20] = thin[3::20] = thin[4::20] = thin[5::20] = thin[6::20] = thin[7::20] = True
+    small = np.zeros((300, 400), bool)
+    small[100:130, 100:130] = True
+    for mask in (thin, small, np.ones((300, 400), bool)):
+        assert np.array_equal(without_rim(mask), mask)
+
+
+def test_white_that_is_left_out_counts_for_the_level():
+    pixels = linear_from_srgb(0.3 + 0.4 * pebbles(200, 200)).astype(np.float32)
+    burnt = pixels.copy()
+    burnt[:, 120:] = 1.0
+    plain, found = (cut_exemplar(x, full(x), flatten=True) for x in (pixels[:, :120].copy(), burnt))
+    assert any("over-exposed" in warning for warning in found.warnings)
+    levels = [np.log(x.pixels[x.mask]).mean() for x in (plain, found)]
+    # two fifths are white, of which no more is known
+    assert levels[1] - levels[0] == pytest.approx(-0.4 * np.log(pixels).mean(), abs=0.1)
 
 
 def test_without_flattening_the_photo_is_kept():

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core import palette
+from material_palette.core.exemplar import RIM
 from material_palette.core.image import linear_from_srgb
 from material_palette.core.region import Region
 from material_palette.core.sides import largest_side
@@ -122,7 +123,7 @@ def test_the_corner_of_a_house_is_said_and_can_be_kept():
     # as bright as both sides together
     assert np.log(linear_from_srgb(picture / 255)).mean() == pytest.approx(np.log(pixels[mask]).mean(), abs=0.02)
     picture, warnings = preview(flatten=False)
-    assert picture.shape[1] == 280 and not any("another side" in warning for warning in warnings)
+    assert picture.shape[1] == 280 - 2 * RIM and not any("another side" in warning for warning in warnings)
 
 
 def test_a_dado_of_another_paint_leaves_the_level_of_the_wall():
