@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from . import brdf, decomposition, engines, front, rectification, reduction, sheet
-from .delighting import LUMINANCE, log_mean
+from .delighting import log_mean
 from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
 from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim
@@ -542,8 +542,7 @@ def _rectified(pixels, region, settings, view, focal, progress) -> rectification
             flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
     flat.warnings[:0] = warnings
     if flat.mask is not whole:
-        change = log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask)
-        flat.level = float(np.exp(change @ LUMINANCE))
+        flat.level = np.exp(log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask))
     return flat
 
 

@@ -35,6 +35,7 @@ ENOUGH_WINDOWS = 20  # to tell any plane; a plane of the photo's frame needs no 
 # over its other planes
 LONGEST_LINES, LEAST_FOLLOWED, LEAST_SECOND = 250, 0.5, 0.06
 LEAST_FRAMED, LEAST_AHEAD = 0.03, 0.03
+AGAINST = 1.5  # times the evidence for a plane that lies FAR from all of the photo's frame
 LEAST_CONFIDENCE = 0.5
 SUSPECTED = 0.05  # confidence from which on a slant that was not told for certain is worth a warning
 # of a texel's density in the photo, in the worst direction
@@ -78,7 +79,7 @@ class Rectification:
     warnings: list[str] = field(default_factory=list)
     cylinder: Cylinder | None = None
     to_surface: np.ndarray | None = None
-    level: float = 1.0
+    level: np.ndarray | float = 1.0
 
     @property
     def slant(self) -> float | None:
@@ -320,7 +321,10 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
         "range": float(np.log(inverse_depth).std()),
         "windows": len(spectra.at),
         "lines": len(segments.ends),
+        "asked": 1.0,
     }
+    if view.frame is not None and min(_between(planes[best], s * a) for a in view.frame.axes for s in (-1, 1)) > FAR:
+        evidence["asked"] = AGAINST
     return PlaneEstimate(planes[best], _confidence(evidence), evidence, spectra)
 
 
@@ -361,7 +365,7 @@ def _confidence(evidence: dict[str, float]) -> float:
     weakest = min(
         evidence["gain"] / LEAST_GAIN, evidence["margin"] / margin, MOST_SPREAD / max(evidence["spread"], 0.1)
     )
-    return _certainty(weakest)
+    return _certainty(weakest / evidence["asked"])
 
 
 def _starts(ray: np.ndarray) -> list[np.ndarray]:

@@ -97,6 +97,15 @@ def test_a_frame_that_the_texture_does_not_follow_is_no_plane_of_its():
     assert found is None or "least_gain" not in found.evidence
 
 
+def test_a_plane_against_the_frame_of_the_photo_takes_more_evidence():
+    pixels, mask = slanted(pebbles(512, 512), tilted(50, 1.2)), np.ones((384, 384), bool)
+    view = view_of(pixels)
+    alone = rectification.find_plane(pixels, mask, view)
+    view.frame = rectification.Frame(np.eye(3), 0.9, 0.3, 0.3, 100, view.focal)
+    against = rectification.find_plane(pixels, mask, view)
+    assert np.array_equal(against.normal, alone.normal) and 0 < against.confidence < alone.confidence
+
+
 def test_lines_that_all_run_one_way_make_no_frame():
     pixels = slanted(bricks(), tilted(50, 1.2))
     boards = pixels.copy()
