@@ -36,6 +36,7 @@ ENOUGH_WINDOWS = 20  # to tell any plane; a plane of the photo's frame needs no 
 LONGEST_LINES, LEAST_FOLLOWED, LEAST_SECOND = 250, 0.5, 0.06
 LEAST_FRAMED, LEAST_AHEAD = 0.03, 0.03
 AGAINST = 1.5  # times the evidence for a plane that lies FAR from all of the photo's frame
+CLEARER = 4.0  # times the gain of the frame's plane, from which on another one is believed, if it is certain
 LEAST_CONFIDENCE = 0.5
 SUSPECTED = 0.05  # confidence from which on a slant that was not told for certain is worth a warning
 # of a texel's density in the photo, in the worst direction
@@ -292,7 +293,7 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     ray = np.append(spectra.at.mean(0), 1.0)
     ray /= np.linalg.norm(ray)
     framed = _framed(spectra, view.frame, ray)
-    if framed is not None or len(spectra.at) < ENOUGH_WINDOWS:
+    if len(spectra.at) < ENOUGH_WINDOWS:
         return framed
     inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     segments = view.segments.within(inside)
@@ -325,7 +326,11 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     }
     if view.frame is not None and min(_between(planes[best], s * a) for a in view.frame.axes for s in (-1, 1)) > FAR:
         evidence["asked"] = AGAINST
-    return PlaneEstimate(planes[best], _confidence(evidence), evidence, spectra)
+    free = PlaneEstimate(planes[best], _confidence(evidence), evidence, spectra)
+    if framed is None:
+        return free
+    clearer = free.confidence >= LEAST_CONFIDENCE and evidence["gain"] > CLEARER * framed.evidence["gain"]
+    return free if clearer else framed
 
 
 def _framed(spectra: Spectra, frame: Frame | None, ray: np.ndarray) -> PlaneEstimate | None:
