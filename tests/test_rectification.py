@@ -106,6 +106,20 @@ def test_a_plane_against_the_frame_of_the_photo_takes_more_evidence():
     assert np.array_equal(against.normal, alone.normal) and 0 < against.confidence < alone.confidence
 
 
+def test_a_wrong_frame_does_not_beat_a_plane_that_is_clear():
+    truth = tilted(50, 1.2)
+    pixels, mask = slanted(bricks(), truth), np.ones((384, 384), bool)
+    view = view_of(pixels)
+    # turned about the courses, as a frame may be that little but they tell of
+    courses = rectification.plane_axes(truth)[0]
+    turn = cv2.Rodrigues(courses * np.radians(44))[0]
+    view.frame = rectification.Frame(
+        np.array([courses, turn @ truth, turn @ np.cross(truth, courses)]), 0.9, 0.07, 0.2, 100, view.focal
+    )
+    found = rectification.find_plane(pixels, mask, view)
+    assert found.confidence >= 0.5 and np.degrees(np.arccos(found.normal @ truth)) < 8
+
+
 def test_lines_that_all_run_one_way_make_no_frame():
     pixels = slanted(bricks(), tilted(50, 1.2))
     boards = pixels.copy()
