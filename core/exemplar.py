@@ -87,10 +87,11 @@ def cut_exemplar(
         warnings.append(f"the region spreads over {w} x {h} px; the fullest {LARGEST} x {LARGEST} px of it are used")
     pixels, mask = np.ascontiguousarray(pixels[box]), np.ascontiguousarray(mask[box])
     seen = mask & (pixels > BLACK).any(-1)
-    before = log_mean(pixels, seen) if seen.any() else 0
+    whole = pixels
     pixels, mask = _without_colourless(pixels, mask, warnings)
-    # what the camera saw as white is as bright as that at least
-    level = level * np.exp((before - log_mean(pixels, mask)) @ LUMINANCE) if seen.any() else level
+    if (seen & mask).any():
+        # what the camera saw as white is as bright as that at least; of black nothing is known
+        level = level * np.exp((log_mean(whole, seen) - log_mean(pixels, seen & mask)) @ LUMINANCE)
     shading = np.ones_like(pixels)
     if flatten:
         light = find_light(pixels, mask, lambda fraction: progress(0.4 * fraction, "evening the light"))

@@ -50,6 +50,16 @@ def test_a_part_of_a_surface_gets_the_level_of_all_of_it():
     assert np.array_equal(*beside)
 
 
+def test_black_joints_leave_the_level_as_it_is():
+    pixels = linear_from_srgb(0.3 + 0.4 * pebbles(200, 200)).astype(np.float32)
+    jointed = pixels.copy()
+    jointed[::20] = jointed[1::20] = 0
+    exemplar = cut_exemplar(jointed, full(jointed))
+    stones = exemplar.mask & (jointed > 0).all(-1)
+    lighter = np.log(exemplar.pixels[stones]).mean() - np.log(jointed[stones]).mean()
+    assert abs(lighter) < 0.05
+
+
 def test_the_rim_of_a_region_is_left_out_where_it_costs_little():
     photo = np.zeros((300, 400), bool)
     photo[:, 100:] = True
