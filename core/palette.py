@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from . import brdf, decomposition, engines, front, rectification, reduction, sheet
-from .delighting import log_mean
+from .delighting import LUMINANCE, log_mean
 from .engines.diffusion import DiffusionSettings
 from .errors import PaletteError
 from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim
@@ -38,6 +38,7 @@ RESOLUTION_RANGE = (64, 8192)
 SCALE_RANGE = (0.25, 8.0)
 LEAST_SAMPLED = 32  # px
 CONCEPT_VERSION = 1
+MOST_LEVEL = 0.5  # of log luminance, by which what is learnt from takes on the level of its whole region
 PREVIEW = 256  # px
 LEAST_FITTED = 16  # px
 HEIGHTS_PER_PIXEL = 2.0  # of a picture, where the relief is displaced
@@ -542,7 +543,9 @@ def _rectified(pixels, region, settings, view, focal, progress) -> rectification
             flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
     flat.warnings[:0] = warnings
     if flat.mask is not whole:
-        flat.level = np.exp(log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask))
+        change = log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask)
+        brighter = change @ LUMINANCE
+        flat.level = np.exp(change - brighter + np.clip(brighter, -MOST_LEVEL, MOST_LEVEL))
     return flat
 
 

@@ -126,6 +126,15 @@ def test_the_corner_of_a_house_is_said_and_can_be_kept():
     assert picture.shape[1] == 280 - 2 * RIM and not any("another side" in warning for warning in warnings)
 
 
+def test_a_side_in_the_dark_takes_the_level_only_so_far():
+    pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
+    mask[20:300, 20:300] = True
+    pixels[:, 190:] *= 0.03
+    picture, _ = palette.preview_exemplar(pixels, Region("house", mask), palette.Settings(rectify="off"), quiet)
+    change = np.log(linear_from_srgb(picture[8:-8, 8:120] / 255)).mean() - np.log(pixels[28:292, 28:140]).mean()
+    assert change == pytest.approx(-palette.MOST_LEVEL, abs=0.03)
+
+
 def test_a_dado_of_another_paint_leaves_the_level_of_the_wall():
     pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
     mask[20:300, 20:300] = True
