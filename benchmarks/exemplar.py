@@ -163,18 +163,10 @@ def judge_slanted(photo: Slanted, texture: Texture, full: bool) -> dict:
     start = time.process_time()
     view = rectification.look(photo.pixels, photo.focal if photo.known else None)
     found = rectification.rectify(photo.pixels, photo.mask, view)
-    seconds = time.process_time() - start
-    error = ""
-    if found.normal is not None:
-        error = float(np.degrees(np.arccos(np.clip(-found.normal @ photo.normal, -1, 1))))
-    claimed = found.homography is not None
-    result = {
-        "cpu_seconds": seconds,
-        "megapixels": photo.mask.sum() / 1e6,
-        "claimed": float(claimed),
-        "normal_error": error if claimed else "",
-        "untouched_error": float(np.degrees(np.arccos(photo.normal[2]))) if not claimed else "",
-        "false": float(claimed and error > FALSE),
+    result = {"cpu_seconds": time.process_time() - start, "megapixels": photo.mask.sum() / 1e6}
+    result |= claim(found, photo)
+    result |= {
+        "untouched_error": float(np.degrees(np.arccos(photo.normal[2]))) if not result["claimed"] else "",
         "confidence": found.confidence,
     }
     if full:
@@ -184,6 +176,14 @@ def judge_slanted(photo: Slanted, texture: Texture, full: bool) -> dict:
             for name, one in (("before", plain), ("after", found))
         }
     return result
+
+
+def claim(found: rectification.Rectification, photo: Slanted) -> dict:
+    """Whether a plane is claimed, how far its normal is off, in degrees, and whether that makes it a false one."""
+    if found.homography is None:
+        return {"claimed": 0.0, "normal_error": "", "false": 0.0}
+    error = float(np.degrees(np.arccos(np.clip(-found.normal @ photo.normal, -1, 1))))
+    return {"claimed": 1.0, "normal_error": error, "false": float(error > FALSE)}
 
 
 def scale_of(found: rectification.Rectification, photo: Slanted) -> float:
@@ -300,11 +300,8 @@ def judge_room(photo: Slanted, texture: Texture, full: bool) -> dict:
     view, result = rectification.look(photo.pixels), {}
     framed = view.frame
     for name, view.frame in (("before", None), ("after", framed)):
-        found = rectification.rectify(photo.pixels, photo.mask, view)
-        claimed = found.homography is not None
-        error = float(np.degrees(np.arccos(np.clip(-found.normal @ photo.normal, -1, 1)))) if claimed else ""
-        result |= {f"normal_error_{name}": error, f"claimed_{name}": float(claimed)}
-        result[f"false_{name}"] = float(claimed and error > FALSE)
+        found = claim(rectification.rectify(photo.pixels, photo.mask, view), photo)
+        result |= {f"{measure}_{name}": value for measure, value in found.items()}
     return result | {"cpu_seconds": time.process_time() - start, "megapixels": photo.mask.sum() / 1e6}
 
 
@@ -417,7 +414,7 @@ FAMILIES = {
         (("lpips", "ST-LPIPS to the flat texture"), ("scale", "texels per px seen from the front")),
     ),
     "room": Family(
-        "degrees that the camera looks down; floor of a room",
+        "floor of a room: camera down, degrees",
         (5.0, 10.0, 20.0, 30.0, 40.0),
         room,
         judge_room,

@@ -14,7 +14,7 @@ import numpy as np
 
 from .cylinder import Cylinder, find_cylinder, unroll
 from .errors import PaletteError
-from .exemplar import CLIPPED, LARGEST, LUMINANCE
+from .exemplar import LARGEST, LUMINANCE, white
 from .image import srgb_from_linear
 from .texture_gradient import Spectra, gradient_scores, local_spectra, plane_axes
 from .vanishing import Frame, Segments, find_focal, find_frame, find_segments, line_score
@@ -281,9 +281,7 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
     scale = min(1.0, LOOKED_AT / float(mask.sum()) ** 0.5)
     size = max(1, round((box[1].stop - box[1].start) * scale)), max(1, round((box[0].stop - box[0].start) * scale))
     grey = cv2.resize(np.ascontiguousarray(pixels[box] @ LUMINANCE), size, interpolation=cv2.INTER_AREA)
-    # pictures of more than white are not clipped
-    white = CLIPPED if pixels[mask].max() <= 1.001 else np.inf
-    seen = mask[box] & (pixels[box] < white).any(-1)
+    seen = mask[box] & (pixels[box] < white(pixels, mask)).any(-1)
     small = cv2.resize(seen.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     centre = np.array(_principal_point(mask.shape))
     own = ((centre - (box[1].start, box[0].start)) + 0.5) * scale - 0.5
@@ -322,11 +320,10 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
         "range": float(np.log(inverse_depth).std()),
         "windows": len(spectra.at),
         "lines": len(segments.ends),
-        "asked": 1.0,
     }
-    if view.frame is not None and min(_between(planes[best], s * a) for a in view.frame.axes for s in (-1, 1)) > FAR:
-        evidence["asked"] = AGAINST
-    free = PlaneEstimate(planes[best], _confidence(evidence), evidence, spectra)
+    against = view.frame is not None and np.abs(view.frame.axes @ planes[best]).max() < np.cos(np.radians(FAR))
+    confidence = _confidence(evidence, AGAINST if against else 1.0)
+    free = PlaneEstimate(planes[best], confidence, evidence, spectra)
     if framed is None:
         return free
     clearer = free.confidence >= LEAST_CONFIDENCE and evidence["gain"] > CLEARER * framed.evidence["gain"]
@@ -336,9 +333,10 @@ def find_plane(pixels: np.ndarray, mask: np.ndarray, view: View) -> PlaneEstimat
 def _framed(spectra: Spectra, frame: Frame | None, ray: np.ndarray) -> PlaneEstimate | None:
     """Of a photo's frame the plane that explains the texture better than its others and, with any part of the region
     left out, better than the front; None where none does. ray (3,): to the middle of the region."""
-    front = gradient_scores(spectra, AXIS)
-    found = []
-    for axis in () if frame is None else frame.axes:
+    if frame is None:
+        return None
+    front, found = gradient_scores(spectra, AXIS), []
+    for axis in frame.axes:
         normal = axis * np.sign(axis @ ray)
         scores = gradient_scores(spectra, normal) if normal @ ray > LEAST_FACING else None
         if scores is not None:
@@ -359,8 +357,8 @@ def _certainty(times: float) -> float:
     return float(1 / (1 + np.exp(-3 * np.log(max(times, 1e-6)))))
 
 
-def _confidence(evidence: dict[str, float]) -> float:
-    """Of a slanted plane: 0.5 where the weakest of what speaks for it just suffices.
+def _confidence(evidence: dict[str, float], asked: float) -> float:
+    """Of a slanted plane: 0.5 where the weakest of what speaks for it is `asked` times what just suffices.
 
     The plane has to explain more than the front does, clearly more than planes more than FAR degrees off, and with any
     part of the region left out it has to stay about the same. Where even the best plane explains little, the texture is
@@ -370,7 +368,7 @@ def _confidence(evidence: dict[str, float]) -> float:
     weakest = min(
         evidence["gain"] / LEAST_GAIN, evidence["margin"] / margin, MOST_SPREAD / max(evidence["spread"], 0.1)
     )
-    return _certainty(weakest / evidence["asked"])
+    return _certainty(weakest / asked)
 
 
 def _starts(ray: np.ndarray) -> list[np.ndarray]:

@@ -121,9 +121,7 @@ def test_a_wrong_frame_does_not_beat_a_plane_that_is_clear():
 
 
 def test_lines_that_all_run_one_way_make_no_frame():
-    pixels = slanted(bricks(), tilted(50, 1.2))
-    boards = pixels.copy()
-    boards[:] = pixels.mean()
+    boards = np.full((384, 384, 3), 0.4, np.float32)
     boards[::24] = 0.05
     assert view_of(boards).frame is None and view_of(pebbles(384, 384)).frame is None
     assert view_of(slanted(bricks(), tilted(50, 0.3))).frame is not None
