@@ -206,7 +206,7 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         name="Show Regions", default=True, description="Show the regions over the photo in the Image Editor"
     )
     auto_regions: IntProperty(
-        name="Regions", default=6, min=1, max=32, soft_max=16, description="The most regions Auto Segment makes"
+        name="Regions", default=8, min=1, max=32, soft_max=16, description="The most regions Auto Segment makes"
     )
     segmentation: EnumProperty(
         name="Segmentation", items=SEGMENTATIONS, description="How Auto Segment tells materials apart"

@@ -285,7 +285,7 @@ def add_exposed(row: str, answers: dict[str, dict[str, Found]], truth: dict[str,
 
 def automatic(shown: scenes.Shown) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """By part the automatic region that fits it best, where one does, and all IoUs."""
-    regions = segment(shown.photo, regions=6)
+    regions = segment(shown.photo)
     masks, ious = {}, {}
     for part, mask in shown.masks.items():
         scores = [(region.mask & mask).sum() / (region.mask | mask).sum() for region in regions]

@@ -37,13 +37,12 @@ from material_palette.benchmarks import regions as measures  # noqa: E402
 from material_palette.benchmarks.collage import collage, photos, scenes, sources  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
 from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
-from material_palette.core.segmentation import segment  # noqa: E402
+from material_palette.core.segmentation import REGIONS, segment  # noqa: E402
 from material_palette.core.segmentation.features import DESCRIBED_PIXELS, describe  # noqa: E402
 from material_palette.core.segmentation.pick import Click, select  # noqa: E402
 from material_palette.core.segmentation.text import text_mask  # noqa: E402
 
 COLLAGES = 12
-BOUND = 6  # the user's upper bound, as by default
 SHOWN = ("kodak_", "azure_")  # photos that may be shown
 KINDS = {"scene": "scenes", "collage": "collages", "photo": "real photos", "later": "real photos, later"}
 PARTS = ("photos", "auto", "stability", "pick", "text", "time", "sheet")
@@ -53,7 +52,7 @@ SIGNS = ("Museum of Modern Art", "BAKERY & CAFE", "No parking here", "Hotel Euro
 def ours(pixels: np.ndarray, count: int) -> np.ndarray:
     labels = np.full(pixels.shape[:2], -1)
     try:
-        for index, region in enumerate(segment(pixels, regions=BOUND)):
+        for index, region in enumerate(segment(pixels, regions=REGIONS)):
             labels[region.mask] = index
     except PaletteError:
         pass
@@ -139,7 +138,7 @@ def real_photos(table: Table, photos: list) -> None:
     for photo in photos:
         for name, method in WHOLE.items():
             if ("photos", photo.name, name) not in table.done and method is not measures.grabcut:
-                labels = method(photo.pixels, BOUND)
+                labels = method(photo.pixels, REGIONS)
                 table.add("photos", photo.name, name, iou=measures.mean_iou(labels, photo.labels, photo.scored))
 
 
@@ -282,7 +281,7 @@ def sheet(data: Path, folder: Path) -> None:
         image = np.round(255 * np.clip(srgb_from_linear(pixels), 0, 1)).astype(np.uint8)[..., ::-1]
         drawn = image // 4
         for index in range(labels.max() + 1):
-            hue = np.uint8([[[index * 180 // BOUND, 220, 255]]])
+            hue = np.uint8([[[index * 180 // REGIONS, 220, 255]]])
             colour = cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0]
             drawn[labels == index] = image[labels == index] // 2 + colour // 2
         scale = 200 / image.shape[0]

@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     extract.add_argument(
         "--weights", type=Path, metavar="PATH", help="weights of sam (a folder) or materialistic (a file)"
     )
-    extract.add_argument("--regions", type=int, default=6, metavar="N", help="at most N found regions (%(default)s)")
+    extract.add_argument("--regions", type=int, default=8, metavar="N", help="at most N found regions (%(default)s)")
     extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
     extract.add_argument("--keep-concepts", action="store_true", help="keep what was learnt, for `resample`")
     extract.add_argument("--metres-per-tile", type=float, default=1.0, metavar="M", help="size of a repeat (1)")

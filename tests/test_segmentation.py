@@ -138,6 +138,16 @@ def test_how_many_materials_are_too_small_is_said(scene):
     assert int(count) >= 3 and float(share) == pytest.approx(100 * 3 * 900 / 360 / 480, rel=0.4)
 
 
+def test_regions_that_are_mixed_for_want_of_number_are_named(scene):
+    pixels, masks = scene
+    words = []
+    regions = segment(pixels, regions=1, warn=words.append)
+    assert len(regions) == 1 and "region_1." in words[-1] and "more regions" in words[-1]
+    words.clear()
+    segment(pixels, regions=len(masks), warn=words.append)
+    assert not words
+
+
 def test_a_photo_of_sky_or_of_blur_alone_is_a_region_all_the_same(scene):
     for pixels in (sky()[:, :120], soft(), cv2.GaussianBlur(scene[0], (0, 0), 4)):
         words = []

@@ -13,13 +13,14 @@ from .pick import Pick
 from .sam import Sam, segment_sam
 
 SEGMENTERS = {"auto": segment_auto, "sam": segment_sam, "materialistic": segment_materialistic}
+REGIONS = 8  # by default
 MOST_REGIONS = 32
 
 
 def segment(
     photo_pixels: np.ndarray,
     engine: str = "auto",
-    regions: int = 6,
+    regions: int = REGIONS,
     seed: int = 0,
     progress: Callable[[float, str], None] = lambda fraction, message: None,
     warn: Callable[[str], None] = lambda text: None,

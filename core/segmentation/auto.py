@@ -12,7 +12,7 @@
    material are: vectors have deviation 1 along each direction within a material, so that limit is one number.
 4. What holds no texture of a surface is left out and said, and takes none of the N: blue sky with its clouds, before 3,
    so that no wall merges with a cloud, and lines of text; overexposed or out of focus, after it; at last what is too
-   thin or too small.
+   thin or too small. A region of surfaces that are not alike, where there are more than regions asked for, is said too.
 """
 
 import heapq
@@ -31,6 +31,9 @@ BORDER_SHARE = 0.65  # a
 SIZE_POWER = 0.4  # p
 TOUCHING_UNTIL = 40  # regions; from there on regions that don't touch may merge too
 ONE_MATERIAL = 16.0  # squared distance of two regions' vectors; below it they are one material
+# mean square of a region's vectors about their mean, from which on it is said to be mixed; at most 19 in scenes and
+# collages of known materials
+UNLIKE = 30.0
 LEAST_SHARE = 0.01  # of the photo; smaller regions don't count among the N and are left out
 CLIPPED = 98.5  # of L, smoothed: white, all three channels at their end
 CLIPPED_SHARE = 0.75  # of a region; what has more than a quarter of its pixels left holds a texture
@@ -73,7 +76,7 @@ def segment_auto(
         if region >= count:
             reason = list(left_out)[region - count]
         elif holds_texture(mask):
-            found.append(mask)
+            found.append((mask, _unlike(features, owner == region)))
         else:
             reason = "is too thin to hold a texture"
         if reason and mask.mean() < LEAST_SHARE:
@@ -84,9 +87,16 @@ def segment_auto(
             warn(f"A region {where} {reason} and is left out. Paint it to have it.")
     if small:
         warn(too_small(len(small), sum(small)))
-    found.sort(key=np.count_nonzero, reverse=True)
+    found.sort(key=lambda pair: np.count_nonzero(pair[0]), reverse=True)
+    named = {f"region_{number}": pair for number, pair in enumerate(found, 1)}
+    mixed = [name for name, (_, unlike) in named.items() if unlike > UNLIKE]
+    if mixed:
+        warn(
+            f"Surfaces that are not alike share a region: {', '.join(mixed)}. "
+            "Ask for more regions or paint the material you want."
+        )
     progress(1.0, "Segmenting")
-    return [Region(f"region_{number}", mask) for number, mask in enumerate(found, 1)]
+    return [Region(name, mask) for name, (mask, _) in named.items()]
 
 
 def surfaces_of(
@@ -140,6 +150,12 @@ def merged(features: Features, parts: np.ndarray, surfaces: np.ndarray, regions:
     kept[large] = np.arange(large.sum())
     kept[small] = -1 - np.arange(small.sum())
     return kept[owner]
+
+
+def _unlike(features: Features, inside: np.ndarray) -> float:
+    """How far the vectors of the superpixels inside (n,) bool lie from their mean: mean square."""
+    vectors, size = features.vectors[inside], features.size[inside]
+    return float(np.average(np.square(vectors - np.average(vectors, 0, size)).sum(1), weights=size))
 
 
 def _connected(features: Features, until: int, progress: Callable[[float], None]) -> np.ndarray:
