@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from .dependencies import install_command, missing
-from .errors import PaletteError
+from .errors import PaletteError, explain
 
 DONE, BAD_INPUT, SOME_FAILED, INTERRUPTED = 0, 2, 3, 130
 
@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
         for photo, masks, folder in _jobs(arguments):
             try:
                 codes.append(_extract(photo, masks, folder, arguments))
-            except PaletteError as error:
+            except Exception as error:  # the other photos go on
                 _complain(error)
                 codes.append(BAD_INPUT)
     except PaletteError as error:
@@ -412,5 +412,5 @@ class _Line:
             self.say(f"{name}: reduced: {e['map']} {e['change']} ({cost}FLIP {e['flip']:.3f})")
 
 
-def _complain(error: PaletteError) -> None:
-    print(f"error: {error}", file=sys.stderr)
+def _complain(error: Exception) -> None:
+    print(f"error: {explain(error)}", file=sys.stderr)

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .texture_gradient import Spectra, spectra_scores
+from .texture_gradient import BLOCKS, Spectra, spectra_scores
 
 DIRECTIONS = 8  # of the axis that are tried first
 MIDDLES, REACHES = (-0.5, 0.0, 0.5), (0.6, 0.9)  # in halves of the region; of the farthest window's middle
 MOST_REACH = 0.985
+NARROWEST = 1e-6  # of the focal length: radius
 LEAST_GAIN = 0.025  # of the score over the best plane's, whatever part of the region is left out; flat ones reach 0.011
 SAMPLES = 2  # per texel and axis
 
@@ -61,7 +62,10 @@ def find_cylinder(spectra: Spectra, plane: np.ndarray) -> tuple[Cylinder | None,
     where there is none. And the least gain of its score with a part left out. plane (1 + BLOCKS,): the best plane's."""
 
     def score(p: tuple) -> np.ndarray:
-        return spectra_scores(spectra, cylinder_maps(placed(*p), spectra.at))
+        cylinder = placed(*p)
+        if cylinder.radius < NARROWEST:  # all windows lie in one line along the axis
+            return np.full(1 + BLOCKS, -np.inf)
+        return spectra_scores(spectra, cylinder_maps(cylinder, spectra.at))
 
     def placed(angle: float, offset: float, reach: float) -> Cylinder:
         across = np.array([np.cos(angle), np.sin(angle)])

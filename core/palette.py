@@ -22,7 +22,7 @@ import torch
 from . import brdf, decomposition, engines, front, rectification, reduction, sheet
 from .delighting import LUMINANCE, log_mean
 from .engines.diffusion import DiffusionSettings
-from .errors import PaletteError
+from .errors import Cancelled, PaletteError, explain
 from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
@@ -206,7 +206,9 @@ def extract_palette(
             share = _part(progress, i / len(regions), (i + 1) / len(regions), f"{region.name}: ")
             try:
                 material, texture = _textured(pixels, region, settings, share, view, focal, engine)
-            except PaletteError as error:
+            except Cancelled:
+                raise
+            except Exception as error:  # whatever it is, it costs one region, not the palette
                 material, texture = _failed(region.name, error, settings), None
             if finishing:
                 finishing[-1].result()  # what failed there ends it here
@@ -222,15 +224,17 @@ def extract_palette(
     return palette
 
 
-def _failed(name: str, error: PaletteError, settings: Settings) -> Material:
-    return Material(name, "failed", error=str(error), metres_per_tile=settings.metres_per_tile)
+def _failed(name: str, error: Exception, settings: Settings) -> Material:
+    return Material(name, "failed", error=explain(error), metres_per_tile=settings.metres_per_tile)
 
 
 def _end_of(material: Material, texture, settings, progress: Progress, on_material) -> Material:
     if material.error is None:
         try:
             _finish(material, texture, settings, progress)
-        except PaletteError as error:
+        except Cancelled:
+            raise
+        except Exception as error:
             material = _failed(material.name, error, settings)
     if on_material:
         on_material(material)

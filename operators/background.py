@@ -7,7 +7,7 @@ import bpy
 from bpy.app.handlers import persistent
 from bpy.types import Operator
 
-from ..core.errors import PaletteError
+from ..core.errors import PaletteError, explain
 from ..core.job import Job
 from .setup import NeedsPackages, missing
 
@@ -216,9 +216,7 @@ class BackgroundOperator(NeedsPackages, _Free):
             self.report({"INFO"}, f"{self.bl_label}: cancelled")
             return {"CANCELLED"}
         if kind == "failed":
-            if not isinstance(value, PaletteError):
-                _print_traceback(value)
-            self._fail(str(value) if isinstance(value, PaletteError) else f"{type(value).__name__}: {value}")
+            self._fail(explain(value))
             return {"CANCELLED"}
         try:
             scene = _scene(run)
@@ -246,12 +244,6 @@ def _over_file_browser(context, event):
 def _scene(run):
     """The scene that the run was started for: undo and renaming keep its number, another file never has it."""
     return next((scene for scene in bpy.data.scenes if scene.session_uid == run.scene_uid), None)
-
-
-def _print_traceback(error):
-    import traceback
-
-    traceback.print_exception(error)
 
 
 def _show(context):

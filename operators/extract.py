@@ -5,7 +5,6 @@ import contextlib
 import os
 import shutil
 import tempfile
-import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import bpy
 import numpy as np
 from bpy.types import Operator
 
-from ..core.errors import Abandoned, Cancelled, PaletteError
+from ..core.errors import Abandoned, Cancelled, PaletteError, explain
 from . import history
 from .background import BackgroundOperator
 from .palette import active_entry, put_in_palette, region_of
@@ -119,9 +118,7 @@ class _Extracts(BackgroundOperator):
             try:
                 self._take(settings, made)
             except Exception as error:
-                if not isinstance(error, PaletteError):
-                    traceback.print_exception(error)
-                made.record |= {"status": "failed", "error": str(error)}
+                made.record |= {"status": "failed", "error": explain(error)}
             region = region_of(settings, made.key)
             if region is not None:
                 region.error = made.record["error"] or ""

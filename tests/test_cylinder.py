@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 from material_palette.core import rectification
-from material_palette.core.cylinder import Cylinder, unroll
+from material_palette.core.cylinder import Cylinder, find_cylinder, unroll
+from material_palette.core.texture_gradient import local_spectra, spectra_scores
 from textures import pebbles
 
 SIDE = 384
@@ -59,3 +60,13 @@ def test_a_measure_across_a_column_follows_its_surface():
     ends = np.array([middle, middle + truth.radius * np.sin(1.0) * truth.across])
     texel = to_surface[0, 0]  # px of the surface
     assert rectification.metres_per_texel(ends, 2.0, found) == pytest.approx(2.0 * texel / truth.radius)
+
+
+@pytest.mark.parametrize("shape", [(640, 64), (64, 640)])
+def test_windows_that_lie_in_one_line_are_round_about_no_axis_along_it(shape):
+    spectra = local_spectra(np.log(pebbles(*shape)[..., 1] + 0.05), np.ones(shape, bool), 1000.0, (0, 0))
+    with np.errstate(divide="raise", invalid="raise"):
+        found, gain = find_cylinder(
+            spectra, spectra_scores(spectra, np.broadcast_to(np.eye(2), (len(spectra.at), 2, 2)))
+        )
+    assert found is None and np.isfinite(gain)

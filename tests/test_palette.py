@@ -1,4 +1,5 @@
 import hashlib
+import importlib
 import json
 import threading
 import time
@@ -49,6 +50,28 @@ def test_one_bad_region_is_reported_and_the_others_are_made(palette):
     assert "speck" in speck.error and "576 px" in speck.error
     assert gravel.svbrdf.albedo.shape == (128, 128, 3)
     assert not np.ndim(paint.svbrdf.roughness)
+
+
+@pytest.mark.parametrize("where", ["core.palette.cut_exemplar", "core.decomposition.decompose"])
+def test_a_mistake_of_ours_costs_one_region(where, monkeypatch, capsys):
+    photo, regions = photo_and_regions()
+    module, name = where.rsplit(".", 1)
+    module = importlib.import_module(f"material_palette.{module}")
+    sound = getattr(module, name)
+
+    calls = []
+
+    def broken(*args):
+        calls.append(args)
+        if len(calls) == 1:  # the gravel's; the paint is a constant
+            raise ZeroDivisionError("by nothing")
+        return sound(*args)
+
+    monkeypatch.setattr(module, name, broken)
+    palette = extract_palette(photo, regions[:2], SETTINGS, quiet)
+    assert [m.status for m in palette.materials] == ["failed", "ok"]
+    assert "ZeroDivisionError: by nothing" in palette.materials[0].error
+    assert "Traceback" in capsys.readouterr().err
 
 
 def test_a_region_of_one_colour_becomes_a_constant(palette):
