@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 TOLERANCE = 0.0075  # of the diagonal: how far a border may lie from the true one, as in the Berkeley benchmark
+PURE, ENOUGH = 0.9, 0.25  # of a region, and of the material, that makes a region an exemplar of it
 LEAST_SHARE = 0.01  # of the photo; smaller regions of an opponent don't count, as ours
 GRABCUT_PIXELS = 160_000
 
@@ -29,11 +30,8 @@ def mean_iou(labels: np.ndarray, truth: np.ndarray, scored: int | None = None) -
     labels, truth (H, W) int, -1: none. Pixels of unknown material don't count. The assignment is the best there is.
     scored: the first so many materials count in the mean (all); the others only as what should not be in a region.
     """
-    known = truth >= 0
-    found, count = labels[known], truth.max() + 1
-    scored = count if scored is None else scored
-    overlap = np.zeros((found.max(initial=-1) + 2, count))
-    np.add.at(overlap, (found + 1, truth[known]), 1)
+    overlap = _overlap(labels, truth)
+    scored = overlap.shape[1] if scored is None else scored
     sizes = overlap.sum(1, keepdims=True)
     scores = (overlap / np.maximum(sizes + overlap.sum(0) - overlap, 1))[1:, :scored]
     best = {0: 0.0}  # bit set of materials that have a region -> sum of IoU
@@ -44,6 +42,23 @@ def mean_iou(labels: np.ndarray, truth: np.ndarray, scored: int | None = None) -
                     key = chosen | 1 << material
                     best[key] = max(best.get(key, 0.0), total + row[material])
     return max(best.values()) / scored
+
+
+def pure(labels: np.ndarray, truth: np.ndarray, scored: int | None = None) -> float:
+    """Share of the true materials of which a region holds ENOUGH while it is PURE; arguments as of `mean_iou`."""
+    overlap = _overlap(labels, truth)[1:]
+    share = overlap / np.maximum(overlap.sum(1, keepdims=True), 1)
+    total = np.bincount(truth[truth >= 0])
+    return float(((share >= PURE) & (overlap >= ENOUGH * total)).any(0)[:scored].mean())
+
+
+def _overlap(labels: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(1 + regions, materials) px that they share, of known materials only; row 0: in no region."""
+    known = truth >= 0
+    found = labels[known] + 1
+    overlap = np.zeros((found.max(initial=0) + 1, truth.max() + 1))
+    np.add.at(overlap, (found, truth[known]), 1)
+    return overlap
 
 
 def boundary_f(labels: np.ndarray, truth: np.ndarray) -> float:

@@ -139,7 +139,14 @@ def real_photos(table: Table, photos: list) -> None:
         for name, method in WHOLE.items():
             if ("photos", photo.name, name) not in table.done and method is not measures.grabcut:
                 labels = method(photo.pixels, REGIONS)
-                table.add("photos", photo.name, name, iou=measures.mean_iou(labels, photo.labels, photo.scored))
+                truth = photo.labels, photo.scored
+                table.add(
+                    "photos",
+                    photo.name,
+                    name,
+                    iou=measures.mean_iou(labels, *truth),
+                    pure=measures.pure(labels, *truth),
+                )
 
 
 def whole_photos(table: Table, photos: list) -> None:
@@ -154,6 +161,7 @@ def whole_photos(table: Table, photos: list) -> None:
                     photo.name,
                     name,
                     iou=measures.mean_iou(labels, photo.labels),
+                    pure=measures.pure(labels, photo.labels),
                     boundary_f=measures.boundary_f(labels, photo.labels),
                     count_error=abs(labels.max() + 1 - count),
                     cpu_seconds=time.process_time() - start,

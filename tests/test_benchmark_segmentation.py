@@ -23,6 +23,19 @@ def test_what_is_not_scored_still_must_not_be_in_a_region():
     assert regions.mean_iou(np.zeros_like(truth), truth, scored=1) == pytest.approx(2 / 3)
 
 
+def test_a_material_has_an_exemplar_where_a_part_of_it_is_a_region_that_is_pure():
+    truth = np.repeat([[0] * 8 + [1] * 8 + [-1] * 4], 4, 0)
+    part = np.full_like(truth, -1)
+    part[:, 4:6] = 0  # a quarter
+    assert regions.pure(part, truth) == 0.5
+    part[:, 5] = -1
+    assert regions.pure(part, truth) == 0
+    mixed = np.where(truth == 1, 1, 0)
+    mixed[:, 8:10] = 0  # a fifth of the first region is the other material
+    assert regions.pure(mixed, truth) == 0.5
+    assert regions.pure(truth, truth, scored=1) == 1
+
+
 def test_borders_are_matched_within_a_little_of_the_diagonal():
     truth, near, far = (np.zeros((300, 400), int) for _ in range(3))
     truth[:, 200:], near[:, 203:], far[:, 210:] = 1, 1, 1
