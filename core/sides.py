@@ -72,6 +72,7 @@ def largest_side(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return mask
     terms = polynomial(inside.shape, 1)
     rest = y - terms @ fit(terms, y, kept)
+    rest -= np.median(rest[kept])
     margin = max(LEAST_STEP, APART * float(masked_blur(rest, kept, max(1.0, REACH * side / 2))[kept].std()))
     beside = cv2.dilate(walls.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     other = np.zeros_like(inside)

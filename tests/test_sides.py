@@ -145,3 +145,12 @@ def test_a_dado_of_another_paint_leaves_the_level_of_the_wall():
     assert any("on another side" in warning for warning in warnings)
     inside = picture[4:150, 4:-4]
     assert np.log(linear_from_srgb(inside / 255)).mean() == pytest.approx(np.log(pixels[kept]).mean(), abs=0.05)
+
+
+def test_of_a_texture_that_is_dark_with_few_bright_spots_the_side_is_kept_too():
+    noise = cv2.GaussianBlur(np.random.default_rng(0).standard_normal((SIZE, SIZE)), (0, 0), 2).astype(np.float32)
+    pixels = np.where(noise > np.quantile(noise, 0.85), 0.9, 0.06)  # its mean is far from its median
+    pixels = np.repeat(pixels[..., None], 3, 2).astype(np.float32)
+    pixels[:, 285:] = 0.45
+    kept = largest_side(pixels, np.ones((SIZE, SIZE), bool))
+    assert kept[:, :265].all() and not kept[:, 295:].any()
