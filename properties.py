@@ -34,7 +34,11 @@ WHITE_BALANCES = (
     ("card", "Grey Card", "Take the light's colour and brightness from a grey card: pick it with the eyedropper"),
 )
 RECTIFY = (
-    ("auto", "Automatic", "Bring a slanted region to the front, by its corners or by the plane that is found"),
+    (
+        "auto",
+        "Automatic",
+        "Bring a slanted region to the front, by its corners or by the plane that is found, and turn it by its lines",
+    ),
     ("quad", "Corners Only", "Bring only regions with corners to the front"),
     ("off", "Off", "Take every region as the photo shows it"),
 )

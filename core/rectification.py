@@ -7,7 +7,7 @@ the region's own lines run in few directions (`vanishing`). Where the spectra ag
 unrolled (`cylinder`). Where nothing says enough, the region stays as it is.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ LOOKED_AT = 512  # px: side of the square with the region's area when its plane 
 LEAST_GAIN, LEAST_MARGIN, POOR_MARGIN, MARGIN_SHARE = 0.04, 0.05, 0.15, 0.25  # of the score, see `_confidence`
 MOST_SPREAD, FAR = 5.0, 20.0  # degrees
 LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
+LEAST_TURN = 1.0  # degrees: by less no region that is seen from the front is turned
 LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middle of its region: 82 degrees
 AXIS = np.array([0.0, 0.0, 1.0])
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
@@ -66,9 +67,9 @@ class Rectification:
 
     pixels (h, w, 3) float32 linear and mask (h, w) bool; homography (3, 3): from its px to the photo's px, None where
     the region was left as it is or unrolled: then cylinder is in photo px, and to_surface (2, 3) goes from its px to
-    the surface laid flat; method: "off", "corners", "auto", "plane" or "cylinder"; normal (3,): unit, towards the
-    camera, camera coordinates (x right, y down, z forward), None when not known; slant in degrees between it and the
-    optical axis; confidence 0 to 1; level as `cut_exemplar` takes it.
+    the surface laid flat; method: "off", "turned", "corners", "auto", "plane" or "cylinder"; normal (3,): unit, towards
+    the camera, camera coordinates (x right, y down, z forward), None when not known; slant in degrees between it and
+    the optical axis; confidence 0 to 1; level as `cut_exemplar` takes it.
     """
 
     pixels: np.ndarray
@@ -144,8 +145,8 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     """Rectify a region of a photo by the plane that is found, if it is.
 
     pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel; view as `look` finds it. A region that is
-    seen from the front, or of which nothing certain is found, is returned as it is, with a warning where much speaks
-    for a slant.
+    seen from the front, or of which nothing certain is found, is turned so that its lines lie along rows and columns,
+    otherwise as it is, with a warning where much speaks for a slant.
     """
     estimate = find_plane(pixels, mask, view)
     bent = _find_cylinder(estimate, view, mask.shape) if estimate is not None else None
@@ -153,11 +154,13 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
         flat, within, to_surface = unroll(pixels, mask, bent, SHARE_BENT, LARGEST)
         return Rectification(flat, within, method="cylinder", cylinder=bent, to_surface=to_surface)
     if estimate is not None and estimate.slant < LEAST_SLANT:
-        return Rectification(pixels, mask, normal=-estimate.normal, confidence=estimate.confidence)
+        seen = Rectification(pixels, mask, normal=-estimate.normal, confidence=estimate.confidence)
+        return _turned(seen, view.segments)
     if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
         confidence = estimate.confidence if estimate else 0.0
         warning = "the slant of the region could not be told for certain; it is used as the photo shows it"
-        return Rectification(pixels, mask, confidence=confidence, warnings=[warning] if confidence >= SUSPECTED else [])
+        warnings = [warning] if confidence >= SUSPECTED else []
+        return _turned(Rectification(pixels, mask, confidence=confidence, warnings=warnings), view.segments)
     where = np.array(_centroid(mask))
     to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
     turn = _turn(view.segments.within(mask), to_photo)
@@ -426,6 +429,15 @@ def _principal_point(shape: tuple[int, int]) -> tuple[float, float]:
 def _centroid(mask: np.ndarray) -> tuple[float, float]:
     y, x = np.nonzero(mask)
     return float(x.mean()), float(y.mean())
+
+
+def _turned(seen: Rectification, segments: Segments) -> Rectification:
+    """A region as the photo shows it, turned so that its lines lie along rows and columns, where they do not."""
+    turn = _turn(segments.within(seen.mask), np.eye(3))
+    if abs(turn[1, 0]) < np.sin(np.radians(LEAST_TURN)):
+        return seen
+    found = resample(seen.pixels, seen.mask, turn, "turned", seen.normal, seen.confidence)
+    return replace(found, warnings=seen.warnings + found.warnings)
 
 
 def _turn(segments: Segments, to_photo: np.ndarray) -> np.ndarray:

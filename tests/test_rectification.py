@@ -133,6 +133,22 @@ def test_a_region_seen_from_the_front_stays_bit_for_bit():
     assert found.homography is None and np.array_equal(found.pixels, pixels) and np.array_equal(found.mask, mask)
 
 
+def test_a_region_seen_from_the_front_is_turned_by_its_lines():
+    for degrees in (-20, 4):
+        turn = cv2.getRotationMatrix2D((255.5, 255.5), degrees, 1)
+        pixels = cv2.warpAffine(bricks(), turn, (512, 512), flags=cv2.INTER_CUBIC)[80:432, 80:432].clip(0)
+        found = rectification.rectify(pixels, np.ones((352, 352), bool), view_of(pixels))
+        assert found.method == "turned" and not found.warnings
+        column, row = found.homography[:2, :2].T
+        assert np.degrees(np.arctan2(*column[::-1])) == pytest.approx(-degrees, abs=0.7)
+        assert np.linalg.norm(column) == pytest.approx(1, abs=0.01) and abs(column @ row) < 1e-6
+        # the joints of the courses fill rows
+        middle = found.pixels[150:300, 150:300, 0]
+        assert (middle < 0.3).mean(1).max() > 0.9
+        level = rectification.rectify(found.pixels, found.mask, view_of(found.pixels))
+        assert level.method == "off"
+
+
 def test_noise_on_a_plain_wall_is_no_plane():
     pixels = 0.5 + 0.002 * np.random.default_rng(0).standard_normal((384, 384, 3)).astype(np.float32)
     found = rectification.rectify(pixels, np.ones((384, 384), bool), view_of(pixels))
