@@ -26,6 +26,7 @@ LEAST_GAIN, LEAST_MARGIN, POOR_MARGIN, MARGIN_SHARE = 0.04, 0.05, 0.15, 0.25  # 
 MOST_SPREAD, FAR = 5.0, 20.0  # degrees
 LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
 LEAST_TURN = 1.0  # degrees: by less no region that is seen from the front is turned
+STRAIGHT, LEAST_STRAIGHT = 3.0, 0.5  # degrees, and share of its lines' length that lies along rows or columns so nearly
 LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middle of its region: 82 degrees
 AXIS = np.array([0.0, 0.0, 1.0])
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
@@ -433,8 +434,14 @@ def _centroid(mask: np.ndarray) -> tuple[float, float]:
 
 def _turned(seen: Rectification, segments: Segments) -> Rectification:
     """A region as the photo shows it, turned so that its lines lie along rows and columns, where they do not."""
-    turn = _turn(segments.within(seen.mask), np.eye(3))
+    lines = segments.within(seen.mask)
+    turn = _turn(lines, np.eye(3))
     if abs(turn[1, 0]) < np.sin(np.radians(LEAST_TURN)):
+        return seen
+    # grass and clouds have lines of one direction too, but loosely
+    step = np.abs((lines.ends[:, 1] - lines.ends[:, 0]) @ turn[:2, :2])
+    length, narrow = np.linalg.norm(step, axis=1), step.min(1) < np.tan(np.radians(STRAIGHT)) * step.max(1)
+    if length[narrow].sum() < LEAST_STRAIGHT * length.sum():
         return seen
     found = resample(seen.pixels, seen.mask, turn, "turned", seen.normal, seen.confidence)
     return replace(found, warnings=seen.warnings + found.warnings)
