@@ -25,6 +25,7 @@ LOOKED_AT = 512  # px: side of the square with the region's area when its plane 
 LEAST_GAIN, LEAST_MARGIN, POOR_MARGIN, MARGIN_SHARE = 0.04, 0.05, 0.15, 0.25  # of the score, see `_confidence`
 MOST_SPREAD, FAR = 5.0, 20.0  # degrees
 LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
+LEAST_PART = 0.3, 0.9  # of a region: its largest part may lie on a plane of its own
 LEAST_TURN = 1.0  # degrees: by less no region that is seen from the front is turned
 STRAIGHT, LEAST_STRAIGHT = 3.0, 0.5  # degrees, and share of its lines' length that lies along rows or columns so nearly
 LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middle of its region: 82 degrees
@@ -147,9 +148,18 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
 
     pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel; view as `look` finds it. A region that is
     seen from the front, or of which nothing certain is found, is turned so that its lines lie along rows and columns,
-    otherwise as it is, with a warning where much speaks for a slant.
+    otherwise as it is, with a warning where much speaks for a slant. Of one that falls apart the largest part is taken
+    where that lies on a plane on which not all does.
     """
-    estimate = find_plane(pixels, mask, view)
+    estimate, warnings = find_plane(pixels, mask, view), []
+    part = _largest_part(mask)
+    if part is not mask:
+        # walls on both sides of a street are one material and two planes
+        own, rest = (find_plane(pixels, m, view) for m in (part, mask & ~part))
+        if _claimed(own) and not (_same_plane(own, estimate) and (not _claimed(rest) or _same_plane(own, rest))):
+            share = 1 - part.sum() / mask.sum()
+            warnings = [f"{share:.0%} of the region, apart from the rest and on another plane, is left out"]
+            estimate, mask = own, part
     bent = _find_cylinder(estimate, view, mask.shape) if estimate is not None else None
     if bent is not None:
         flat, within, to_surface = unroll(pixels, mask, bent, SHARE_BENT, LARGEST)
@@ -160,18 +170,34 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
         confidence = estimate.confidence if estimate else 0.0
         warning = "the slant of the region could not be told for certain; it is used as the photo shows it"
-        warnings = [warning] if confidence >= SUSPECTED else []
+        warnings += [warning] if confidence >= SUSPECTED else []
         return _turned(Rectification(pixels, mask, confidence=confidence, warnings=warnings), view.segments)
     where = np.array(_centroid(mask))
     to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
     turn = _turn(view.segments.within(mask), to_photo)
-    return resample(pixels, mask, to_photo @ turn, "auto", -estimate.normal, estimate.confidence)
+    found = resample(pixels, mask, to_photo @ turn, "auto", -estimate.normal, estimate.confidence)
+    return replace(found, warnings=warnings + found.warnings)
+
+
+def _largest_part(mask: np.ndarray) -> np.ndarray:
+    """The largest connected part of a mask (H, W) bool; itself where that is nearly all of it or little of it."""
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    areas = sizes[1:, cv2.CC_STAT_AREA]
+    least, most = LEAST_PART
+    return labels == 1 + areas.argmax() if least < areas.max() / areas.sum() < most else mask
+
+
+def _claimed(estimate: PlaneEstimate | None) -> bool:
+    return estimate is not None and estimate.confidence >= LEAST_CONFIDENCE and estimate.slant >= LEAST_SLANT
+
+
+def _same_plane(known: PlaneEstimate, other: PlaneEstimate | None) -> bool:
+    return _claimed(other) and _between(known.normal, other.normal) < FAR
 
 
 def _find_cylinder(estimate: PlaneEstimate, view: View, shape: tuple[int, int]) -> Cylinder | None:
     """The cylinder, in photo px, that the texture of a region is on rather than on its best plane; None for a plane."""
-    claimed = estimate.slant >= LEAST_SLANT and estimate.confidence >= LEAST_CONFIDENCE
-    if estimate.spectra is None or claimed:
+    if estimate.spectra is None or _claimed(estimate):
         return None
     planes = np.max([gradient_scores(estimate.spectra, n) for n in (AXIS, estimate.normal)], 0)
     found, _ = find_cylinder(estimate.spectra, planes)
@@ -536,9 +562,9 @@ def resample(
     within = within.reshape(h, w)
     if not within.any():
         raise PaletteError("the region is seen too obliquely to be rectified; paint a nearer part of it")
-    lost = 1 - within.sum() / max(1.0, np.abs(area[good]).sum() * scale**2 * len(x) / len(points))
+    lost = 1 - kept.mean()
     if lost > 0.5:
-        warnings.append(f"{lost:.0%} of the region's surface is seen too obliquely and left out")
+        warnings.append(f"{lost:.0%} of the region is seen too obliquely and left out")
     return Rectification(
         _warp(pixels, homography, (h, w), within), within, homography, method, normal, confidence, warnings
     )

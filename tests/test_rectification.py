@@ -133,6 +133,22 @@ def test_a_region_seen_from_the_front_stays_bit_for_bit():
     assert found.homography is None and np.array_equal(found.pixels, pixels) and np.array_equal(found.mask, mask)
 
 
+def test_of_walls_on_both_sides_of_a_street_the_larger_one_is_brought_to_the_front():
+    left, right = tilted(55, 0.0), tilted(55, np.pi)
+    pixels, mask = slanted(bricks(), left), np.ones((384, 384), bool)
+    pixels[:, 220:] = slanted(bricks(), right)[:, 220:]
+    mask[:, 190:220] = False
+    view = view_of(pixels)
+    found = rectification.rectify(pixels, mask, view)
+    assert found.method == "auto" and np.degrees(np.arccos(found.normal @ -left)) < 8
+    (warning,) = (w for w in found.warnings if "another plane" in w)
+    assert warning.startswith("46%")
+    # of one wall behind a lamp post nothing is left out
+    pixels = slanted(bricks(), left)
+    found = rectification.rectify(pixels, mask, view_of(pixels))
+    assert found.method == "auto" and not any("another plane" in w for w in found.warnings)
+
+
 def test_a_region_seen_from_the_front_is_turned_by_its_lines():
     for degrees in (-20, 4):
         turn = cv2.getRotationMatrix2D((255.5, 255.5), degrees, 1)
