@@ -20,6 +20,7 @@ MIDDLES, REACHES = (-0.5, 0.0, 0.5), (0.6, 0.9)  # in halves of the region; of t
 MOST_REACH = 0.985
 NARROWEST = 1e-6  # of the focal length: radius
 LEAST_GAIN = 0.025  # of the score over the best plane's, whatever part of the region is left out; flat ones reach 0.011
+LEAST_SEEN = 0.5  # of the radius, on each side of the axis
 SAMPLES = 2  # per texel and axis
 
 
@@ -85,8 +86,23 @@ def find_cylinder(spectra: Spectra, plane: np.ndarray) -> tuple[Cylinder | None,
                 found = score(tuple(p))[0]
                 if found > value:
                     best, value = tuple(p), found
-    gain = float((score(best) - plane).min())
-    return (placed(*best) if gain > LEAST_GAIN else None), gain
+    gain, cylinder = float((score(best) - plane).min()), placed(*best)
+    return (cylinder if gain > LEAST_GAIN and _round_on_both_sides(spectra, cylinder) else None), gain
+
+
+def _round_on_both_sides(spectra: Spectra, cylinder: Cylinder) -> bool:
+    """Whether the texture of each side of the axis tells the cylinder by itself: a flat region whose texture changes
+    towards one edge is best explained by an axis along the other."""
+    t = (spectra.at @ cylinder.across - cylinder.middle) / cylinder.radius
+    for side in (t < 0, t >= 0):
+        if np.abs(t[side]).max(initial=0) < LEAST_SEEN:
+            return False
+        at, power, frequency = spectra.at[side], spectra.power[side], spectra.frequency[side]
+        part = Spectra(at, power, frequency, np.arange(len(at)) % BLOCKS)
+        flat = np.tile(np.eye(2), (len(at), 1, 1))
+        if spectra_scores(part, cylinder_maps(cylinder, at))[0] <= spectra_scores(part, flat)[0]:
+            return False
+    return True
 
 
 def unroll(pixels: np.ndarray, mask: np.ndarray, cylinder: Cylinder, share: float, largest: int):

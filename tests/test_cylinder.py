@@ -42,6 +42,13 @@ def test_a_column_is_found_and_unrolled():
     assert found.record()["cylinder"]["radius_px"] == pytest.approx(found.cylinder.radius, abs=0.01)
 
 
+def test_what_is_compressed_towards_one_edge_only_is_no_column():
+    photo, mask, truth = column()
+    y, x = np.mgrid[:SIDE, :SIDE]
+    mask &= np.stack([x, y], -1) @ truth.across > truth.middle - 5
+    assert rectification.rectify(photo, mask, rectification.look(photo)).method != "cylinder"
+
+
 def test_unrolled_the_texture_is_the_flat_one():
     photo, mask, truth = column()
     flat, within, to_surface = unroll(photo, mask, truth, 0.5, 1536)
