@@ -66,7 +66,7 @@ def cut_exemplar(
     flatten: bool = True,
     white_balance: str | np.ndarray = "off",
     progress: Callable[[float, str], None] = lambda fraction, message: None,
-    level: np.ndarray | float = 1.0,
+    level: float = 1.0,
 ) -> Exemplar:
     """Cut a region out of a photo, leave out what isn't fit to learn from, and flatten its illumination.
 
@@ -75,8 +75,8 @@ def cut_exemplar(
     region that spreads wider than LARGEST the fullest part is cut. With white_balance "region" the colour of the light
     is taken from the region, whose mean is taken to be grey: for plaster, concrete, snow. White_balance (3,) is what
     the photo shows of a grey card: then brightness and colour of the light are known. level: how many times as bright
-    as these pixels the surface is of which they are a part, such as a box's one side, in the geometric mean, (3,) by
-    channel: without a grey card that is the best guess of the light.
+    as these pixels the surface is of which they are a part, such as a box's one side, in the geometric mean:
+    without a grey card that is the best guess of the light.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -91,7 +91,7 @@ def cut_exemplar(
     pixels, mask = _without_colourless(pixels, mask, warnings)
     if (seen & mask).any():
         # what the camera saw as white is as bright as that at least; of black nothing is known
-        level = level * np.exp((log_mean(whole, seen) - log_mean(pixels, seen & mask)) @ LUMINANCE)
+        level *= float(np.exp((log_mean(whole, seen) - log_mean(pixels, seen & mask)) @ LUMINANCE))
     shading = np.ones_like(pixels)
     if flatten:
         light = find_light(pixels, mask, lambda fraction: progress(0.4 * fraction, "evening the light"))
@@ -112,11 +112,10 @@ def cut_exemplar(
         if beyond > LEAST_SAID:
             warnings.append(f"{beyond:.0%} of the region is brighter than white beside the grey card, and cut there")
     else:
-        if flatten and np.any(level != 1):
-            level = np.broadcast_to(np.float32(level), 3)
+        if flatten and level != 1:
             # nothing reflects more light than falls on it
-            brightest = float(np.quantile((pixels / shading * level)[mask].max(-1), BRIGHTEST))
-            shading = shading / (level / np.float32(np.clip(brightest, 1, max(1.0, float(level @ LUMINANCE)))))
+            brightest = float(np.quantile((pixels / shading)[mask].max(-1), BRIGHTEST))
+            shading = shading / np.float32(min(level, max(1.0, 1 / max(brightest, 1e-6))))
         if white_balance == "region":
             mean = (pixels / shading)[mask].mean(0)
             shading = shading * (mean / max(float(mean @ LUMINANCE), 1e-6)).clip(1e-3)

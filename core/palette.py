@@ -547,9 +547,8 @@ def _rectified(pixels, region, settings, view, focal, progress) -> rectification
             flat = rectification.rectify(pixels, mask, view or rectification.look(pixels, focal))
     flat.warnings[:0] = warnings
     if flat.mask is not whole:
-        change = log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask)
-        brighter = change @ LUMINANCE
-        flat.level = np.exp(change - brighter + np.clip(brighter, -MOST_LEVEL, MOST_LEVEL))
+        brighter = (log_mean(pixels, whole) - log_mean(flat.pixels, flat.mask)) @ LUMINANCE
+        flat.level = float(np.exp(np.clip(brighter, -MOST_LEVEL, MOST_LEVEL)))
     return flat
 
 

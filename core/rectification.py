@@ -83,7 +83,7 @@ class Rectification:
     warnings: list[str] = field(default_factory=list)
     cylinder: Cylinder | None = None
     to_surface: np.ndarray | None = None
-    level: np.ndarray | float = 1.0
+    level: float = 1.0
 
     @property
     def slant(self) -> float | None:

@@ -135,6 +135,16 @@ def test_a_side_in_the_dark_takes_the_level_only_so_far():
     assert change == pytest.approx(-palette.MOST_LEVEL, abs=0.03)
 
 
+def test_a_side_in_other_light_leaves_the_hue_as_it_is():
+    pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
+    mask[20:300, 20:300] = True
+    pixels[:, 190:] *= np.float32([0.5, 0.55, 0.6])
+    picture, warnings = palette.preview_exemplar(pixels, Region("house", mask), palette.Settings(rectify="off"), quiet)
+    assert any("on another side" in warning for warning in warnings)
+    red, green, blue = linear_from_srgb(picture[8:-8, 8:120] / 255).mean((0, 1))
+    assert red == pytest.approx(green, rel=0.01) and blue == pytest.approx(green, rel=0.01)
+
+
 def test_a_dado_of_another_paint_leaves_the_level_of_the_wall():
     pixels, mask = textured(0.05), np.zeros((SIZE, SIZE), bool)
     mask[20:300, 20:300] = True
