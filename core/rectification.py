@@ -151,15 +151,7 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     otherwise as it is, with a warning where much speaks for a slant. Of one that falls apart the largest part is taken
     where that lies on a plane on which not all does.
     """
-    estimate, warnings = find_plane(pixels, mask, view), []
-    part = _largest_part(mask)
-    if part is not mask:
-        # walls on both sides of a street are one material and two planes
-        own, rest = (find_plane(pixels, m, view) for m in (part, mask & ~part))
-        if _claimed(own) and not (_same_plane(own, estimate) and (not _claimed(rest) or _same_plane(own, rest))):
-            share = 1 - part.sum() / mask.sum()
-            warnings = [f"{share:.0%} of the region, apart from the rest and on another plane, is left out"]
-            estimate, mask = own, part
+    estimate, mask, warnings = _plane_of_most(pixels, mask, view)
     bent = _find_cylinder(estimate, view, mask.shape) if estimate is not None else None
     if bent is not None:
         flat, within, to_surface = unroll(pixels, mask, bent, SHARE_BENT, LARGEST)
@@ -170,13 +162,29 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     if estimate is None or estimate.confidence < LEAST_CONFIDENCE:
         confidence = estimate.confidence if estimate else 0.0
         warning = "the slant of the region could not be told for certain; it is used as the photo shows it"
-        warnings += [warning] if confidence >= SUSPECTED else []
+        warnings = [warning] if confidence >= SUSPECTED else []
         return _turned(Rectification(pixels, mask, confidence=confidence, warnings=warnings), view.segments)
     where = np.array(_centroid(mask))
     to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
     turn = _turn(view.segments.within(mask), to_photo)
     found = resample(pixels, mask, to_photo @ turn, "auto", -estimate.normal, estimate.confidence)
     return replace(found, warnings=warnings + found.warnings)
+
+
+def _plane_of_most(
+    pixels: np.ndarray, mask: np.ndarray, view: View
+) -> tuple[PlaneEstimate | None, np.ndarray, list[str]]:
+    """The plane of a region, what of it (H, W) bool lies on it, and what to say of the rest: walls on both sides
+    of a street are one material on two planes."""
+    whole, part = find_plane(pixels, mask, view), _largest_part(mask)
+    if part is mask:
+        return whole, mask, []
+    own, rest = (find_plane(pixels, m, view) for m in (part, mask & ~part))
+    on_one = _same_plane(own, whole) and (not _claimed(rest) or _same_plane(own, rest))
+    if on_one or not _claimed(own):
+        return whole, mask, []
+    share = 1 - part.sum() / mask.sum()
+    return own, part, [f"{share:.0%} of the region, apart from the rest and on another plane, is left out"]
 
 
 def _largest_part(mask: np.ndarray) -> np.ndarray:
@@ -191,8 +199,8 @@ def _claimed(estimate: PlaneEstimate | None) -> bool:
     return estimate is not None and estimate.confidence >= LEAST_CONFIDENCE and estimate.slant >= LEAST_SLANT
 
 
-def _same_plane(known: PlaneEstimate, other: PlaneEstimate | None) -> bool:
-    return _claimed(other) and _between(known.normal, other.normal) < FAR
+def _same_plane(one: PlaneEstimate | None, other: PlaneEstimate | None) -> bool:
+    return _claimed(one) and _claimed(other) and _between(one.normal, other.normal) < FAR
 
 
 def _find_cylinder(estimate: PlaneEstimate, view: View, shape: tuple[int, int]) -> Cylinder | None:
