@@ -305,6 +305,48 @@ def judge_room(photo: Slanted, texture: Texture, full: bool) -> dict:
     return result | {"cpu_seconds": time.process_time() - start, "megapixels": photo.mask.sum() / 1e6}
 
 
+# ---------------------------------------------------------------- turned in the photo's plane
+
+
+@dataclass
+class Turned:
+    """A photo of a texture from the front: pixels (side, side, 3) float32 linear; its rows lie at `degrees`."""
+
+    pixels: np.ndarray
+    degrees: float
+
+
+def turned(texture: Texture, degrees: float, random: np.random.Generator, side: int) -> Turned:
+    """The rows to the right and down by so many degrees, at a random scale and place."""
+    h, w = texture.pixels.shape[:2]
+    density, turn = random.uniform(0.7, 1.3) * min(h, w) / 640, np.radians(degrees)
+    u, v = np.meshgrid(*[np.arange(side) - (side - 1) / 2] * 2)
+    x, y = np.cos(turn) * u + np.sin(turn) * v, np.cos(turn) * v - np.sin(turn) * u
+    at = np.stack([x, y], -1) * density + random.uniform(0, 1000, 2)
+    wrapped = np.pad(texture.pixels, ((1, 2), (1, 2), (0, 0)), mode="wrap")
+    photo = cv2.remap(wrapped, (at % (w, h) + 1).astype(np.float32), None, cv2.INTER_LINEAR)
+    encoded = srgb_from_linear(photo.clip(0, 1)) + (random.standard_normal(photo.shape) / 255).astype(np.float32)
+    return Turned(linear_from_srgb(np.rint(encoded.clip(0, 1) * 255) / np.float32(255)), degrees)
+
+
+def judge_turned(photo: Turned, texture: Texture, full: bool) -> dict:
+    """left: degrees between the texture's rows or columns and the exemplar's."""
+    start, mask = time.process_time(), np.ones(photo.pixels.shape[:2], bool)
+    found = rectification.rectify(photo.pixels, mask, rectification.look(photo.pixels))
+    seconds, angle = time.process_time() - start, 0.0
+    if found.homography is not None:
+        middle = np.array(found.mask.shape[::-1]) / 2
+        (x0, y0), (x1, y1) = cv2.perspectiveTransform(np.array([[middle, middle + [1, 0]]]), found.homography)[0]
+        angle = np.degrees(np.arctan2(y1 - y0, x1 - x0))
+    return {
+        "cpu_seconds": seconds,
+        "megapixels": mask.sum() / 1e6,
+        "claimed": float(found.method == "turned"),
+        "flattened": float(found.method in ("auto", "cylinder")),
+        "left": abs((photo.degrees - angle + 45) % 90 - 45),
+    }
+
+
 # ---------------------------------------------------------------- curved
 
 
@@ -426,6 +468,13 @@ FAMILIES = {
         curved,
         judge_curved,
         (("stretch", "stretch of the texels, log"), ("claimed", "share unrolled"), SLANT_CURVES[2]),
+    ),
+    "turned": Family(
+        "degrees in the photo's plane",
+        (0.0, 2.0, 5.0, 10.0, 20.0, 40.0),
+        turned,
+        judge_turned,
+        (("left", "degrees to the exemplar's rows or columns"), ("claimed", "share turned")),
     ),
 }
 for _name, (_axis, _severities) in lighting.FAMILIES.items():
