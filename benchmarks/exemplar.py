@@ -37,7 +37,7 @@ from material_palette.core.cylinder import Cylinder  # noqa: E402
 from material_palette.core.engines import patch  # noqa: E402
 from material_palette.core.exemplar import cut_exemplar  # noqa: E402
 from material_palette.core.image import linear_from_srgb, read_photo, srgb_from_linear  # noqa: E402
-from material_palette.core.texture_gradient import plane_axes  # noqa: E402
+from material_palette.core.texture_gradient import AXIS, plane_axes  # noqa: E402
 from material_palette.core.torus import resize  # noqa: E402
 
 SAMPLES = 2  # of the rendered photos, per px and axis
@@ -318,15 +318,9 @@ class Turned:
 
 def turned(texture: Texture, degrees: float, random: np.random.Generator, side: int) -> Turned:
     """The rows to the right and down by so many degrees, at a random scale and place."""
-    h, w = texture.pixels.shape[:2]
-    density, turn = random.uniform(0.7, 1.3) * min(h, w) / 640, np.radians(degrees)
-    u, v = np.meshgrid(*[np.arange(side) - (side - 1) / 2] * 2)
-    x, y = np.cos(turn) * u + np.sin(turn) * v, np.cos(turn) * v - np.sin(turn) * u
-    at = np.stack([x, y], -1) * density + random.uniform(0, 1000, 2)
-    wrapped = np.pad(texture.pixels, ((1, 2), (1, 2), (0, 0)), mode="wrap")
-    photo = cv2.remap(wrapped, (at % (w, h) + 1).astype(np.float32), None, cv2.INTER_LINEAR)
-    encoded = srgb_from_linear(photo.clip(0, 1)) + (random.standard_normal(photo.shape) / 255).astype(np.float32)
-    return Turned(linear_from_srgb(np.rint(encoded.clip(0, 1) * 255) / np.float32(255)), degrees)
+    density = random.uniform(0.7, 1.3) * min(texture.pixels.shape[:2]) / 640
+    pixels, _ = photograph(texture.pixels, AXIS, side, (side, side), density, np.radians(degrees), random)
+    return Turned(pixels, degrees)
 
 
 def judge_turned(photo: Turned, texture: Texture, full: bool) -> dict:

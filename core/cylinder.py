@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .texture_gradient import BLOCKS, Spectra, spectra_scores
+from .texture_gradient import AXIS, BLOCKS, Spectra, gradient_scores, spectra_scores
 
 DIRECTIONS = 8  # of the axis that are tried first
 MIDDLES, REACHES = (-0.5, 0.0, 0.5), (0.6, 0.9)  # in halves of the region; of the farthest window's middle
@@ -99,8 +99,7 @@ def _round_on_both_sides(spectra: Spectra, cylinder: Cylinder) -> bool:
             return False
         at, power, frequency = spectra.at[side], spectra.power[side], spectra.frequency[side]
         part = Spectra(at, power, frequency, np.arange(len(at)) % BLOCKS)
-        flat = np.tile(np.eye(2), (len(at), 1, 1))
-        if spectra_scores(part, cylinder_maps(cylinder, at))[0] <= spectra_scores(part, flat)[0]:
+        if spectra_scores(part, cylinder_maps(cylinder, at))[0] <= gradient_scores(part, AXIS)[0]:
             return False
     return True
 

@@ -4,7 +4,8 @@ The plane comes from the user's four corners, from a camera and an object, or is
 lines of the whole photo follow, since what people build stands in one frame, the one under which the texture's local
 spectra agree (`texture_gradient`); where none of them will do, of all planes the one under which the spectra agree and
 the region's own lines run in few directions (`vanishing`). Where the spectra agree better on a round surface, that is
-unrolled (`cylinder`). Where nothing says enough, the region stays as it is.
+unrolled (`cylinder`). Where nothing says enough, the region stays as it is, but turned so that its lines lie along rows
+and columns.
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from .cylinder import Cylinder, find_cylinder, unroll
 from .errors import PaletteError
 from .exemplar import LARGEST, LUMINANCE, white
 from .image import srgb_from_linear
-from .texture_gradient import Spectra, gradient_scores, local_spectra, plane_axes
+from .texture_gradient import AXIS, Spectra, gradient_scores, local_spectra, plane_axes
 from .vanishing import Frame, Segments, find_focal, find_frame, find_segments, line_score
 
 MODES = ("off", "auto", "quad")
@@ -25,11 +26,10 @@ LOOKED_AT = 512  # px: side of the square with the region's area when its plane 
 LEAST_GAIN, LEAST_MARGIN, POOR_MARGIN, MARGIN_SHARE = 0.04, 0.05, 0.15, 0.25  # of the score, see `_confidence`
 MOST_SPREAD, FAR = 5.0, 20.0  # degrees
 LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
-LEAST_PART = 0.3, 0.9  # of a region: its largest part may lie on a plane of its own
+PART = 0.3, 0.9  # of a region: a largest part of this share may lie on a plane of its own
 LEAST_TURN = 1.0  # degrees: by less no region that is seen from the front is turned
 STRAIGHT, LEAST_STRAIGHT = 3.0, 0.5  # degrees, and share of its lines' length that lies along rows or columns so nearly
 LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middle of its region: 82 degrees
-AXIS = np.array([0.0, 0.0, 1.0])
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
 ENOUGH_LINES = 100
 ENOUGH_WINDOWS = 20  # to tell any plane; a plane of the photo's frame needs no more than make spectra
@@ -179,10 +179,13 @@ def _plane_of_most(
     whole, part = find_plane(pixels, mask, view), _largest_part(mask)
     if part is mask:
         return whole, mask, []
-    own, rest = (find_plane(pixels, m, view) for m in (part, mask & ~part))
-    on_one = _same_plane(own, whole) and (not _claimed(rest) or _same_plane(own, rest))
-    if on_one or not _claimed(own):
+    own = find_plane(pixels, part, view)
+    if not _claimed(own):
         return whole, mask, []
+    if _same_plane(own, whole):
+        rest = find_plane(pixels, mask & ~part, view)
+        if not _claimed(rest) or _same_plane(own, rest):
+            return whole, mask, []
     share = 1 - part.sum() / mask.sum()
     return own, part, [f"{share:.0%} of the region, apart from the rest and on another plane, is left out"]
 
@@ -191,7 +194,7 @@ def _largest_part(mask: np.ndarray) -> np.ndarray:
     """The largest connected part of a mask (H, W) bool; itself where that is nearly all of it or little of it."""
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     areas = sizes[1:, cv2.CC_STAT_AREA]
-    least, most = LEAST_PART
+    least, most = PART
     return labels == 1 + areas.argmax() if least < areas.max() / areas.sum() < most else mask
 
 
@@ -199,8 +202,8 @@ def _claimed(estimate: PlaneEstimate | None) -> bool:
     return estimate is not None and estimate.confidence >= LEAST_CONFIDENCE and estimate.slant >= LEAST_SLANT
 
 
-def _same_plane(one: PlaneEstimate | None, other: PlaneEstimate | None) -> bool:
-    return _claimed(one) and _claimed(other) and _between(one.normal, other.normal) < FAR
+def _same_plane(known: PlaneEstimate, other: PlaneEstimate | None) -> bool:
+    return _claimed(other) and _between(known.normal, other.normal) < FAR
 
 
 def _find_cylinder(estimate: PlaneEstimate, view: View, shape: tuple[int, int]) -> Cylinder | None:

@@ -18,6 +18,7 @@ from functools import cache
 
 import numpy as np
 
+AXIS = np.array([0.0, 0.0, 1.0])  # of the camera: the normal of what is seen from the front
 WINDOW = 64  # px
 HOP = 32
 LEAST_COVER = 0.85  # of a window by the region, weighted

@@ -88,15 +88,14 @@ def segment_auto(
     if small:
         warn(too_small(len(small), sum(small)))
     found.sort(key=lambda pair: np.count_nonzero(pair[0]), reverse=True)
-    named = {f"region_{number}": pair for number, pair in enumerate(found, 1)}
-    mixed = [name for name, (_, unlike) in named.items() if unlike > UNLIKE]
+    mixed = [f"region_{number}" for number, (_, unlike) in enumerate(found, 1) if unlike > UNLIKE]
     if mixed:
         warn(
             f"Surfaces that are not alike share a region: {', '.join(mixed)}. "
             "Ask for more regions or paint the material you want."
         )
     progress(1.0, "Segmenting")
-    return [Region(name, mask) for name, (mask, _) in named.items()]
+    return [Region(f"region_{number}", mask) for number, (mask, _) in enumerate(found, 1)]
 
 
 def surfaces_of(
