@@ -133,5 +133,6 @@ def unroll(pixels: np.ndarray, mask: np.ndarray, cylinder: Cylinder, share: floa
     inside = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
     within = inside & (cylinder.density(at) >= share * scale)
     within[within] = mask[row[within], column[within]]
-    flat = np.maximum(cv2.resize(fine, (int(w), int(h)), interpolation=cv2.INTER_AREA), 0)
+    # cubic interpolation oversteps: beyond white no camera sees
+    flat = np.clip(cv2.resize(fine, (int(w), int(h)), interpolation=cv2.INTER_AREA), 0, pixels.max())
     return flat, within.reshape(h, w), np.column_stack([np.eye(2) / scale, low])

@@ -32,6 +32,7 @@ LEAST_LEFT = 0.2  # of the patches; with fewer left the exemplar would no longer
 # patches that this may cost
 RIM, RIM_SHARE, RIM_COST = 2, 0.005, 0.2
 SPECK, HOLE = 5, 9  # px: side of the least square of white or black that is left out; smaller ones belong to a texture
+LINE = 40  # px: a speck that is as long is a line
 LEAST_SAID = 0.01  # of the region
 # of `_sharpness`: 1 % of 89 photographed textures lie below it, and half of them after a blur of 2 px, all of 4 px
 SOFT = 0.58
@@ -161,12 +162,27 @@ def white(pixels: np.ndarray, mask: np.ndarray) -> float:
     return CLIPPED if pixels.max(where=mask[..., None], initial=0) <= 1.001 else np.inf
 
 
+def without_white(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> np.ndarray:
+    """The mask (H, W) bool without areas where a channel of the photo (H, W, 3) is at its end; itself where too little
+    would be left, of which `cut_exemplar` tells. Appends to warnings."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    cut, inside, said = pixels[box], mask[box], []
+    part = _without_area(inside, (cut >= white(cut, inside)).any(-1), SPECK, "over-exposed", said)[0]
+    if part is inside:
+        return mask
+    warnings += said
+    left = mask.copy()
+    left[box] = part
+    return left
+
+
 def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and mask without what the camera saw as white or as black; appends to warnings.
 
-    An area is left out where one channel is at its end, for its hue is wrong. Specks of plain white or of GLARE are
-    filled from around them: left out they would take every patch that holds one with them; in others with a channel at
-    its end there is texture yet. A joint or a hole may be black; a black area is a failure.
+    An area is left out where one channel is at its end, for its hue is wrong. Specks of plain white or of GLARE, unless
+    they are lines, are filled from around them: left out they would take every patch that holds one with them; in
+    others with a channel at its end there is texture yet. A joint or a hole may be black; a black area is a failure.
     """
     ends, black = pixels >= white(pixels, mask), (pixels <= BLACK).all(-1)
     clipped = ends.any(-1)
@@ -175,6 +191,7 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
     if specks.any():
         glare = (pixels > GLARE * masked_blur(pixels, mask & ~clipped, SPECK)).any(-1)
         specks &= glare | (pixels.min(-1) > PLAIN)
+        specks &= ~_long(mask & (clipped | glare))
         share = specks.sum() / mask.sum()
         if share > LEAST_SAID:
             warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")
@@ -194,6 +211,13 @@ def _without_area(
     elif share > LEAST_SAID:
         warnings.append(f"{share:.0%} of the region is {what} and left out")
     return left, area
+
+
+def _long(bright: np.ndarray) -> np.ndarray:
+    """Those of what is bright (h, w) bool that go on like lines: white paint, joints; glare comes in specks."""
+    _, parts, facts, _ = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=8)
+    sides = facts[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1)
+    return bright & (sides >= LINE)[parts]
 
 
 def _filled(pixels: np.ndarray, mask: np.ndarray, lost: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from . import brdf, decomposition, engines, front, rectification, reduction, she
 from .delighting import LUMINANCE, log_mean
 from .engines.diffusion import DiffusionSettings
 from .errors import Cancelled, PaletteError, explain
-from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim
+from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim, without_white
 from .image import linear_from_srgb, srgb_from_linear, write_image
 from .material import SVBRDF
 from .perceptual import Crops
@@ -528,7 +528,8 @@ def _exemplar(flat: rectification.Rectification, settings: Settings, progress: P
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
     """The region seen from the front, or as it is; of a region on a solid's several sides the largest."""
     whole, warnings = region.mask, []
-    mask = without_rim(whole)
+    # first: what is white tells nothing of sides and planes, and seen from the front may outweigh all else
+    mask = without_white(pixels, without_rim(whole), warnings)
     if settings.flatten and region.corners is None:
         progress(0.0, "looking for the sides of the region")
         side = largest_side(pixels, mask)

@@ -603,7 +603,8 @@ def _warp(pixels: np.ndarray, homography: np.ndarray, size: tuple[int, int], wit
             borderMode=cv2.BORDER_REPLICATE,
         )
         result[top : top + rows] = cv2.resize(band, (w, rows), interpolation=cv2.INTER_AREA) if samples > 1 else band
-    return np.maximum(result, 0)
+    # cubic interpolation oversteps: beyond white no camera sees
+    return np.clip(result, 0, pixels.max())
 
 
 def _fullest_window(mask: np.ndarray, homography: np.ndarray, side: np.ndarray) -> np.ndarray:

@@ -57,6 +57,8 @@ def test_unrolled_the_texture_is_the_flat_one():
     texture = pebbles(512, 512)
     column_, row = np.rint(at).astype(int).T % 512
     assert np.corrcoef(flat[within][:, 1], texture[row, column_][:, 1])[0, 1] > 0.8
+    # cubic interpolation must not overstep what the camera calls white
+    assert unroll((photo > 0.4).astype(np.float32), mask, truth, 0.5, 1536)[0].max() == 1
 
 
 def test_a_measure_across_a_column_follows_its_surface():

@@ -144,6 +144,16 @@ def test_specks_of_plain_white_and_of_glare_are_filled_and_a_bright_surface_kept
     assert cut_exemplar(photo, full(photo), flatten=False).pixels[:, 65:].max() < 0.5
 
 
+def test_white_lines_are_paint_and_no_glare():
+    photo = linear_from_srgb(0.2 + 0.3 * pebbles(160, 160))
+    for x in range(160):
+        photo[60 + x // 4 : 63 + x // 4, x] = 1.0 if x % 9 else 0.9  # the camera did not clip all of it
+    photo[20:50:10, 20:140:8] = 1.0
+    found = cut_exemplar(photo, full(photo), flatten=False).pixels
+    assert np.array_equal(found[55:], photo[55:])
+    assert found[20:50:10, 20:140:8].max() < 0.5
+
+
 def test_specks_far_from_all_others_are_filled_too():
     pixels = linear_from_srgb(0.2 + 0.6 * pebbles(120, 120))
     lost = np.zeros((120, 120), bool)

