@@ -191,7 +191,7 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
     if specks.any():
         glare = (pixels > GLARE * masked_blur(pixels, mask & ~clipped, SPECK)).any(-1)
         specks &= glare | (pixels.min(-1) > PLAIN)
-        specks &= ~_long(mask & (clipped | glare))
+        specks &= ~_long(mask & glare)
         share = specks.sum() / mask.sum()
         if share > LEAST_SAID:
             warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")

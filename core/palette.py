@@ -528,8 +528,7 @@ def _exemplar(flat: rectification.Rectification, settings: Settings, progress: P
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
     """The region seen from the front, or as it is; of a region on a solid's several sides the largest."""
     whole, warnings = region.mask, []
-    # first: what is white tells nothing of sides and planes, and seen from the front may outweigh all else
-    mask = without_white(pixels, without_rim(whole), warnings)
+    mask = without_rim(whole)
     if settings.flatten and region.corners is None:
         progress(0.0, "looking for the sides of the region")
         side = largest_side(pixels, mask)
@@ -538,6 +537,8 @@ def _rectified(pixels, region, settings, view, focal, progress) -> rectification
             warnings.append(f"{share:.0%} of the region, on another side or in another light, is left out")
             whole = whole if same_hue(pixels, side, mask & ~side) else side
             mask = side
+    # before it is rectified: a near part that is white would outweigh a far one that is not
+    mask = without_white(pixels, mask, warnings)
     if settings.rectify == "off" or (settings.rectify == "quad" and region.corners is None):
         flat = rectification.Rectification(pixels, mask)
     else:
