@@ -398,7 +398,7 @@ def test(arguments):
 
 
 # the longest first, for two at a time
-SUITES = ("endtoend", "speed", "stability", "exemplar", "texture", "svbrdf", "needs", "segmentation")
+SUITES = ("endtoend", "speed", "stability", "rendered", "exemplar", "texture", "svbrdf", "needs", "segmentation")
 WITH_DATA = ("exemplar", "svbrdf", "segmentation")  # have no data of their own
 WITHOUT_DATA = ("speed",)  # have all they need
 

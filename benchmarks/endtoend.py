@@ -153,24 +153,31 @@ def _quiet(fraction: float, message: str) -> None:
     pass
 
 
-def extracted(photo, mask, shown, part, quality, decomposers, view, resolution, card=None) -> dict[str, Found]:
-    """By decomposer what the product finds in a region; shown and part say how large a metre is there; card is what
-    the photo shows of a grey card."""
+def extracted(photo, mask, part, quality, decomposers, view, resolution, seed=0, card=None):
+    """The material that the product makes of a region, and by decomposer its full maps and their CPU seconds; card is
+    what the photo shows of a grey card."""
     light = {"white_balance": "card", "grey_card": card} if card else {}
-    settings = palette.Settings(quality=quality, decomposer="kept", resolution=resolution, **light)
+    settings = palette.Settings(quality=quality, decomposer="kept", resolution=resolution, seed=seed, **light)
     _kept.clear()
     start = time.process_time()
     material = palette.extract_material(photo, Region(part, mask), settings, _quiet, view)
     base = time.process_time() - start
-    homography = material.rectification.get("homography")
-    density = scenes.texels_per_metre(shown, part, None if homography is None else np.array(homography))
     found = {}
     for name in decomposers:
         start, maps = time.process_time(), material.svbrdf
         if "texture" in _kept:
             maps = decomposition.decompose(_kept["texture"], _quiet, name)
-        found[name] = Found(maps, density, base + time.process_time() - start, tuple(material.warnings))
-    return found
+        found[name] = maps, base + time.process_time() - start
+    return material, found
+
+
+def measured(photo, mask, shown, part, quality, decomposers, view, resolution, card=None) -> dict[str, Found]:
+    """By decomposer what is extracted, at the scale that shown and part tell."""
+    material, found = extracted(photo, mask, part, quality, decomposers, view, resolution, card=card)
+    homography = material.rectification.get("homography")
+    density = scenes.texels_per_metre(shown, part, None if homography is None else np.array(homography))
+    warnings = tuple(material.warnings)
+    return {name: Found(maps, density, seconds, warnings) for name, (maps, seconds) in found.items()}
 
 
 def rows_of(number, shown, part, tile, truth: Known, every, view, auto, card, options, random) -> dict[str, Found]:
@@ -180,7 +187,7 @@ def rows_of(number, shown, part, tile, truth: Known, every, view, auto, card, op
 
     def take(label, mask, quality, decomposers, card=None):
         try:
-            found = extracted(photo, mask, shown, part, quality, decomposers, view, options.resolution, card)
+            found = measured(photo, mask, shown, part, quality, decomposers, view, options.resolution, card)
             rows.update({label.format(name): one for name, one in found.items()})
         except PaletteError as error:
             print(f"{part}, {label}: {error}")
@@ -247,11 +254,17 @@ def compare(truth: SVBRDF, tile: float, found: Found, seed: int) -> dict[str, fl
     for name, first, second in zip("ANR", theirs, ours, strict=True):
         pairs = [(measures.window(first, a, SIDE), measures.window(second, b, SIDE)) for a, b in places]
         row[name] = float(np.mean([perceptual.distance(*pair) for pair in pairs]))
-    lab = [svbrdf.cielab(mean_colour(m).reshape(1, 1, 3))[0, 0] for m in (truth, found.maps)]
-    row["colour"] = float(svbrdf.ciede2000(*lab))
-    row["roughness"] = float(abs(np.mean(truth.roughness) - np.mean(found.maps.roughness)))
-    row["tilt"] = abs(tilt(truth) - tilt(found.maps))
-    return row
+    return row | compare_means(truth, found.maps)
+
+
+def compare_means(truth: SVBRDF, maps: SVBRDF) -> dict[str, float]:
+    """Those of MEASURES that no scale changes."""
+    lab = [svbrdf.cielab(mean_colour(m).reshape(1, 1, 3))[0, 0] for m in (truth, maps)]
+    return {
+        "colour": float(svbrdf.ciede2000(*lab)),
+        "roughness": float(abs(np.mean(truth.roughness) - np.mean(maps.roughness))),
+        "tilt": abs(tilt(truth) - tilt(maps)),
+    }
 
 
 def compare_pictures(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
@@ -283,11 +296,11 @@ def add_exposed(row: str, answers: dict[str, dict[str, Found]], truth: dict[str,
         answers[part][row + EXPOSED] = replace(found, maps=maps)
 
 
-def automatic(shown: scenes.Shown) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """By part the automatic region that fits it best, where one does, and all IoUs."""
-    regions = segment(shown.photo)
+def automatic(photo: np.ndarray, parts: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """By part, given by its true mask, the automatic region that fits it best, where one does, and all IoUs."""
+    regions = segment(photo)
     masks, ious = {}, {}
-    for part, mask in shown.masks.items():
+    for part, mask in parts.items():
         scores = [(region.mask & mask).sum() / (region.mask | mask).sum() for region in regions]
         best = int(np.argmax(scores))
         ious[part] = float(scores[best])
@@ -318,7 +331,7 @@ def run_scene(number: int, tested, every, options, keep: Path) -> dict:
     tiles = {part: tile_of(maps, across[part]) for part, maps in truth.items()}
     view = palette.rectification.look(shown.photo)
     card = scene.show_card(shown.gain)
-    auto, ious = automatic(shown) if options.auto else ({}, {})
+    auto, ious = automatic(shown.photo, shown.masks) if options.auto else ({}, {})
     result, answers = {"kind": kind, "parts": [], "again": []}, {}
     for i, part in enumerate(shown.masks):
         random = np.random.default_rng([number, i])
@@ -374,7 +387,7 @@ def resembling(number: int, tested, every, options) -> list[dict]:
     kind, parts, truth, _, shown = photographed(number, tested, options)
     across = scenes.KINDS[kind]
     view, found = palette.rectification.look(shown.photo), []
-    auto = automatic(shown)[0] if options.auto else {}
+    auto = automatic(shown.photo, shown.masks)[0] if options.auto else {}
     for i, (part, mask) in enumerate(shown.masks.items()):
         random, known, tile = np.random.default_rng([number, i, 1]), parts[part], across[part]
         alike, others = by_class(known, every)
@@ -387,7 +400,7 @@ def resembling(number: int, tested, every, options) -> list[dict]:
             if region is None:
                 continue
             try:
-                ours = extracted(
+                ours = measured(
                     shown.photo, region, shown, part, "balanced", DECOMPOSERS[:1], view, options.resolution
                 )["unet"]
             except PaletteError as error:
