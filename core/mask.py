@@ -5,6 +5,8 @@ import numpy as np
 
 from .region import LEAST_AREA
 
+STRAY, MOST_STRAYS = 0.05, 0.1  # share of the largest part's area that a stray piece has at most; of the region, all
+
 
 def grow(mask: np.ndarray, distance: float) -> np.ndarray:
     """What lies within `distance` px of the mask; below 0 the mask without what lies that near to its border."""
@@ -29,6 +31,18 @@ def islands(mask: np.ndarray, least: int = LEAST_AREA) -> list[np.ndarray]:
     parts = [labels == label for label in large]
     parts[0] |= np.isin(labels, [label for label in by_area if label not in large])
     return parts
+
+
+def without_strays(mask: np.ndarray) -> np.ndarray:
+    """The mask without pieces that a brush or a segmenter has left beside it: such as are tiny beside the largest part,
+    and few; itself where there are none, or where it consists of them."""
+    count, labels, statistics, _centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    area = statistics[:, cv2.CC_STAT_AREA].astype(np.int64)
+    area[0] = 0
+    stray = area < STRAY * area.max()
+    if count < 3 or not 0 < area[stray].sum() <= MOST_STRAYS * area.sum():
+        return mask
+    return ~stray[labels]
 
 
 def polygon(shape: tuple[int, int], points: np.ndarray) -> np.ndarray:

@@ -23,8 +23,9 @@ from . import brdf, decomposition, engines, front, rectification, reduction, she
 from .delighting import LUMINANCE, log_mean
 from .engines.diffusion import DiffusionSettings
 from .errors import Cancelled, PaletteError, explain
-from .exemplar import WHITE_BALANCES, Exemplar, cut_exemplar, without_rim, without_white
+from .exemplar import LEAST_SAID, WHITE_BALANCES, Exemplar, cut_exemplar, without_rim, without_white
 from .image import linear_from_srgb, srgb_from_linear, write_image
+from .mask import without_strays
 from .material import SVBRDF
 from .perceptual import Crops
 from .region import GEOMETRY, Region, check_region, file_name, region_geometry
@@ -527,7 +528,11 @@ def _exemplar(flat: rectification.Rectification, settings: Settings, progress: P
 
 def _rectified(pixels, region, settings, view, focal, progress) -> rectification.Rectification:
     """The region seen from the front, or as it is; of a region on a solid's several sides the largest."""
-    whole, warnings = region.mask, []
+    whole, warnings = without_strays(region.mask), []
+    if whole is not region.mask:
+        share = 1 - whole.sum() / region.mask.sum()
+        if share > LEAST_SAID:
+            warnings.append(f"{share:.0%} of the region, pieces beside it, is left out")
     mask = without_rim(whole)
     if settings.flatten and region.corners is None:
         progress(0.0, "looking for the sides of the region")

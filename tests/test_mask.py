@@ -50,3 +50,22 @@ def test_polygon_fills_what_is_inside_even_beyond_the_photo():
     assert square.sum() == pytest.approx(40 * 60, rel=0.05)
     assert square[21:79, 11:49].all() and not square[:19].any() and not square[:, 52:].any()
     assert edit.polygon((120, 160), [(-500, -500), (900, -500), (900, 900), (-500, 900)]).all()
+
+
+def test_pieces_that_are_tiny_and_few_are_strays():
+    region = np.zeros((200, 200), bool)
+    region[20:120, 20:120] = True
+    strays = region.copy()
+    strays[180:183, 180:190] = True
+    strays[5, 190] = True
+    assert np.array_equal(edit.without_strays(strays), region)
+    for kept in (region, np.zeros_like(region)):
+        assert edit.without_strays(kept) is kept
+    two = region.copy()
+    two[150:190, 20:60] = True
+    assert edit.without_strays(two) is two
+    leaves = np.zeros((200, 200), bool)
+    leaves[:40, :40] = True
+    leaves[60::10, 60::10] = True
+    leaves[61::10, 60::10] = True
+    assert edit.without_strays(leaves) is leaves  # so many pieces that the region consists of them

@@ -10,7 +10,7 @@ import pytest
 from material_palette.core import decomposition
 from material_palette.core.errors import Cancelled, PaletteError
 from material_palette.core.image import linear_from_srgb, srgb_from_linear
-from material_palette.core.palette import Settings, extract_palette, write_palette
+from material_palette.core.palette import Settings, extract_palette, preview_exemplar, write_palette
 from material_palette.core.region import Region
 from material_palette.core.torus import WRAP_GATE, wrap_ratio
 from textures import pebbles, quiet
@@ -80,6 +80,15 @@ def test_a_region_of_one_colour_becomes_a_constant(palette):
     assert paint.svbrdf.normal.tolist() == [0, 0, 1] and paint.svbrdf.height is None
     assert any("one colour" in warning for warning in paint.warnings)
     assert paint.seconds.get("sample") is None
+
+
+def test_pieces_beside_a_region_change_nothing():
+    photo, (gravel, _, _) = photo_and_regions()
+    strays = gravel.mask.copy()
+    strays[20:40, 280:300] = True
+    clean, soiled = (preview_exemplar(photo, Region("gravel", mask), SETTINGS, quiet) for mask in (gravel.mask, strays))
+    assert np.array_equal(clean[0], soiled[0])
+    assert soiled[1] == ["1% of the region, pieces beside it, is left out", *clean[1]]
 
 
 def test_files_are_those_of_the_record_and_every_map_tiles(palette, written):
