@@ -29,6 +29,9 @@ LEAST_SLANT = 10.0  # degrees: below it the region stays as it is
 PART = 0.3, 0.9  # of a region: a largest part of this share may lie on a plane of its own
 LEAST_TURN = 1.0  # degrees: by less no region that is seen from the front is turned
 STRAIGHT, LEAST_STRAIGHT = 3.0, 0.5  # degrees, and share of its lines' length that lies along rows or columns so nearly
+# lines that tell a plane by themselves: how many, off by how many degrees at most; the share of their length that is so
+# straight on the plane, how much more that is than from the front, and the least of it across the others
+LEAST_SQUARED, SQUARE, LEAST_SQUARE, MORE_SQUARE, LEAST_ACROSS = 20, 1.5, 0.7, 0.3, 0.04
 LEAST_FACING = 0.14  # cosine of the angle at which a plane is seen in the middle of its region: 82 degrees
 LINES_WEIGHT = 0.3  # of the lines' score, when there are ENOUGH_LINES
 ENOUGH_LINES = 100
@@ -146,12 +149,16 @@ def rectify_corners(
 def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
     """Rectify a region of a photo by the plane that is found, if it is.
 
-    pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel; view as `look` finds it. A region that is
-    seen from the front, or of which nothing certain is found, is turned so that its lines lie along rows and columns,
-    otherwise as it is, with a warning where much speaks for a slant. Of one that falls apart the largest part is taken
-    where that lies on a plane on which not all does.
+    pixels (H, W, 3) float32 linear; mask (H, W) bool with at least one pixel; view as `look` finds it. Where texture
+    and frame tell no plane for certain, that is taken on which the region's lines become rows and columns. What is seen
+    from the front, or on no certain plane, is turned so that its lines lie along rows and columns, otherwise as it is,
+    with a warning where much speaks for a slant. Of a region that falls apart the largest part is taken where that lies
+    on a plane on which not all does.
     """
     estimate, mask, warnings = _plane_of_most(pixels, mask, view)
+    squared = None if _claimed(estimate) else _squared(mask, view)
+    if squared is not None:
+        return _flat(pixels, mask, squared, view, warnings)
     bent = _find_cylinder(estimate, view, mask.shape) if estimate is not None else None
     if bent is not None:
         flat, within, to_surface = unroll(pixels, mask, bent, SHARE_BENT, LARGEST)
@@ -164,10 +171,14 @@ def rectify(pixels: np.ndarray, mask: np.ndarray, view: View) -> Rectification:
         warning = "the slant of the region could not be told for certain; it is used as the photo shows it"
         warnings = [warning] if confidence >= SUSPECTED else []
         return _turned(Rectification(pixels, mask, confidence=confidence, warnings=warnings), view.segments)
-    where = np.array(_centroid(mask))
-    to_photo = plane_to_photo(estimate.normal, view.focal, _principal_point(mask.shape), where)
+    return _flat(pixels, mask, estimate, view, warnings)
+
+
+def _flat(pixels, mask: np.ndarray, plane: PlaneEstimate, view: View, warnings: list[str]) -> Rectification:
+    """A region brought to the front from a plane, its lines along rows and columns."""
+    to_photo = plane_to_photo(plane.normal, view.focal, _principal_point(mask.shape), _centroid(mask))
     turn = _turn(view.segments.within(mask), to_photo)
-    found = resample(pixels, mask, to_photo @ turn, "auto", -estimate.normal, estimate.confidence)
+    found = resample(pixels, mask, to_photo @ turn, "auto", -plane.normal, plane.confidence)
     return replace(found, warnings=warnings + found.warnings)
 
 
@@ -471,17 +482,44 @@ def _centroid(mask: np.ndarray) -> tuple[float, float]:
 
 def _turned(seen: Rectification, segments: Segments) -> Rectification:
     """A region as the photo shows it, turned so that its lines lie along rows and columns, where they do not."""
-    lines = segments.within(seen.mask)
-    turn = _turn(lines, np.eye(3))
-    if abs(turn[1, 0]) < np.sin(np.radians(LEAST_TURN)):
-        return seen
+    turn, shares = _straight(segments.within(seen.mask), np.eye(3), STRAIGHT)
     # grass and clouds have lines of one direction too, but loosely
-    step = np.abs((lines.ends[:, 1] - lines.ends[:, 0]) @ turn[:2, :2])
-    length, narrow = np.linalg.norm(step, axis=1), step.min(1) < np.tan(np.radians(STRAIGHT)) * step.max(1)
-    if length[narrow].sum() < LEAST_STRAIGHT * length.sum():
+    if abs(turn[1, 0]) < np.sin(np.radians(LEAST_TURN)) or shares.sum() < LEAST_STRAIGHT:
         return seen
     found = resample(seen.pixels, seen.mask, turn, "turned", seen.normal, seen.confidence)
     return replace(found, warnings=seen.warnings + found.warnings)
+
+
+def _squared(mask: np.ndarray, view: View) -> PlaneEstimate | None:
+    """The plane on which a region's lines become rows and columns, as they are not from the front: uprights and courses
+    of a wall that converge. None where there is none."""
+    lines, where, centre = view.segments.within(mask), _centroid(mask), _principal_point(mask.shape)
+    if len(lines.ends) < LEAST_SQUARED:
+        return None
+    own = find_frame(lines, view.focal, centre)
+    axes = ([own.axes[2]] if own else []) + (list(view.frame.axes) if view.frame else [])
+    ray = np.append((np.array(where) - centre) / view.focal, 1.0)
+    found = None, LEAST_SQUARE
+    for axis in axes:
+        normal = axis * np.sign(axis @ ray)
+        if normal @ ray > LEAST_FACING * np.linalg.norm(ray):
+            shares = _straight(lines, plane_to_photo(normal, view.focal, centre, where), SQUARE)[1]
+            if shares.sum() > found[1] and shares.min() >= LEAST_ACROSS:
+                found = normal, float(shares.sum())
+    normal, share = found
+    if normal is None or share < _straight(lines, np.eye(3), SQUARE)[1].sum() + MORE_SQUARE:
+        return None
+    return PlaneEstimate(normal, share, {"lines": len(lines.ends)})
+
+
+def _straight(lines: Segments, to_photo: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """The turn of `_turn`, and the shares (2,) of the lines' length that then lie along rows and along columns, off by
+    `degrees` at most."""
+    turn = _turn(lines, to_photo)
+    step = np.abs(np.diff(_mapped(np.linalg.inv(to_photo @ turn), lines.ends.reshape(-1, 2)).reshape(-1, 2, 2), axis=1))
+    length = np.linalg.norm(np.diff(lines.ends, axis=1), axis=2)[:, 0]
+    flat = step[:, 0, ::-1] < np.tan(np.radians(degrees)) * step[:, 0]
+    return turn, (length @ flat) / max(length.sum(), 1e-9)
 
 
 def _turn(segments: Segments, to_photo: np.ndarray) -> np.ndarray:

@@ -165,6 +165,23 @@ def test_a_region_seen_from_the_front_is_turned_by_its_lines():
         assert level.method == "off"
 
 
+def test_uprights_and_courses_that_converge_tell_the_plane_of_a_wall():
+    wall = np.full((512, 512, 3), 0.5, np.float32)
+    wall[::64] = wall[1::64] = 0.1
+    boards = wall.copy()
+    boards[:, ::24] = boards[:, 1::24] = 0.1
+    normal = tilted(14, 0.8)
+    for texture, found in ((boards, True), (wall, False)):  # lines of one direction lie on many planes
+        photo = slanted(texture, normal)
+        view, mask = view_of(photo), np.ones(photo.shape[:2], bool)
+        estimate = rectification._squared(mask, view)
+        assert (estimate is not None) == found
+    flat = rectification.rectify(slanted(boards, normal), mask, view_of(slanted(boards, normal)))
+    assert flat.method == "auto"
+    assert np.degrees(np.arccos(flat.normal @ -normal)) < 2
+    assert rectification._squared(mask, view_of(boards[:384, :384])) is None  # from the front there is nothing to gain
+
+
 def test_noise_on_a_plain_wall_is_no_plane():
     pixels = 0.5 + 0.002 * np.random.default_rng(0).standard_normal((384, 384, 3)).astype(np.float32)
     found = rectification.rectify(pixels, np.ones((384, 384), bool), view_of(pixels))
