@@ -47,12 +47,12 @@ def textures(number: int, materials: list[endtoend.Known], size: tuple[int, int]
     view, found = palette.rectification.look(shown.photo), []
     for part, mask in shown.masks.items():
         try:
-            answer = endtoend.extracted(shown.photo, mask, shown, part, "balanced", ("kept",), view, SIZE)["kept"]
+            maps = endtoend.extracted(shown.photo, mask, part, "balanced", ("kept",), view, SIZE)[1]["kept"][0]
         except PaletteError as error:
             print(f"{number} {part}: {error}", flush=True)
             continue
-        if answer.maps.albedo.ndim == 3:
-            found.append((part, parts[part].name, float(truth[part].roughness.mean()), answer.maps.albedo))
+        if maps.albedo.ndim == 3:
+            found.append((part, parts[part].name, float(truth[part].roughness.mean()), maps.albedo))
     return found
 
 
