@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Known materials in scenes that are not ours: DATA/scenes, photos with true masks and the materials' names.
 
-    python3 dev.py bench rendered --data DATA -o DIR        # half an hour of one core; goes on where it was stopped
+    python3 dev.py bench rendered --data DATA -o DIR        # 45 minutes of one core; goes on where it was stopped
     python3 dev.py bench rendered --quick                   # one photo of two procedural materials
 
 Rows and distances are those of `endtoend`. How large a metre is in these photos nobody says, so every row is compared
@@ -58,10 +58,8 @@ class Truth:
 
     def distance(self, name: str, picture: np.ndarray) -> float:
         """Shift-tolerant LPIPS of map `name` to a picture of it at the truth's scale, mean over the crops."""
-        apart = []
-        for first, second in zip(self.seen[name], self._features(picture, 1), strict=True):
-            apart.append(sum(float((a - b).square().sum(0).mean()) for a, b in zip(first, second, strict=True)))
-        return float(np.mean(apart))
+        pairs = zip(self.seen[name], self._features(picture, 1), strict=True)
+        return float(np.mean([perceptual.between(*pair) for pair in pairs]))
 
     def compare(self, maps: SVBRDF) -> tuple[dict[str, float], float]:
         """The distances of MEASURES at the one of DENSITIES at which albedo is nearest, and that."""

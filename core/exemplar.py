@@ -32,7 +32,7 @@ LEAST_LEFT = 0.2  # of the patches; with fewer left the exemplar would no longer
 # patches that this may cost
 RIM, RIM_SHARE, RIM_COST = 2, 0.005, 0.2
 SPECK, HOLE = 5, 9  # px: side of the least square of white or black that is left out; smaller ones belong to a texture
-LINE = 40  # px: a speck that is as long is a line
+LINE = 40  # px: what is bright over such a length is a line, no specks
 LEAST_SAID = 0.01  # of the region
 # of `_sharpness`: 1 % of 89 photographed textures lie below it, and half of them after a blur of 2 px, all of 4 px
 SOFT = 0.58

@@ -75,8 +75,12 @@ def _batch(pixels: np.ndarray) -> torch.Tensor:
 
 def distance(first: np.ndarray, second: np.ndarray) -> float:
     """Shift-tolerant LPIPS of two pictures (H, W, 3) of one size: 0 for the same, about 0.5 for unrelated ones."""
-    pairs = zip(features(first), features(second), strict=True)
-    return float(sum((a - b).square().sum(0).mean() for a, b in pairs))
+    return between(features(first), features(second))
+
+
+def between(first: list[torch.Tensor], second: list[torch.Tensor]) -> float:
+    """The distance of two pictures of which `features` are known."""
+    return float(sum((a - b).square().sum(0).mean() for a, b in zip(first, second, strict=True)))
 
 
 class Crops:
