@@ -76,12 +76,20 @@ def scenes(data: Path) -> list[Truth]:
     """The rendered scenes of the data folder, in sorted order."""
     found = []
     for folder in sorted((data / "scenes").iterdir()):
-        pixels = read_photo(folder / "photo.png").pixels
+        pixels, masks, _ = read_scene(folder)
         labels = np.full(pixels.shape[:2], -1)
-        for index, part in enumerate(json.loads((folder / "truth.json").read_text(encoding="utf-8"))):
-            labels[read_mask(folder / "masks" / f"{part}.png", labels.shape)] = index
+        for index, mask in enumerate(masks.values()):
+            labels[mask] = index
         found.append(Truth(folder.name, pixels, labels))
     return found
+
+
+def read_scene(folder: Path) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, str]]:
+    """A rendered scene's photo (H, W, 3) linear, and by part its mask (H, W) bool and its material's name."""
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    pixels = read_photo(folder / "photo.png").pixels
+    masks = {part: read_mask(folder / "masks" / f"{part}.png", pixels.shape[:2]) for part in truth}
+    return pixels, masks, {part: one["material"] for part, one in truth.items()}
 
 
 def photos(data: Path, file: Path = LABELS) -> list[Truth]:

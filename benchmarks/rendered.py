@@ -11,7 +11,6 @@ seed), rendered.json with the table, the chart, and the sheet: of every part the
 """
 
 import argparse
-import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -27,22 +26,16 @@ import dev  # noqa: E402
 dev.load_package()
 from material_palette.benchmarks import charts, endtoend, measures, records, svbrdf  # noqa: E402
 from material_palette.benchmarks.baselines import largest_square  # noqa: E402
+from material_palette.benchmarks.collage import read_scene  # noqa: E402
 from material_palette.benchmarks.endtoend import FLAT, MEASURES, OURS, ROUGHNESS, SIDE  # noqa: E402
 from material_palette.benchmarks.made import make_data  # noqa: E402
 from material_palette.core import palette, perceptual  # noqa: E402
 from material_palette.core.errors import PaletteError  # noqa: E402
-from material_palette.core.image import read_photo, srgb_from_linear  # noqa: E402
+from material_palette.core.image import srgb_from_linear  # noqa: E402
 from material_palette.core.material import SVBRDF  # noqa: E402
 
 RESOLUTION = 512  # px of extracted maps, at the photo's scale
 DENSITIES = 2.0 ** np.arange(6, 9.01, 0.5)  # px of a map to a tile of the truth
-
-
-def read_scene(folder: Path) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, str]]:
-    """Photo (H, W, 3) linear, and by part its mask (H, W) bool and its material's name."""
-    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
-    masks = {part: cv2.imread(str(folder / "masks" / f"{part}.png"), cv2.IMREAD_GRAYSCALE) > 0 for part in truth}
-    return read_photo(folder / "photo.png").pixels, masks, {part: x["material"] for part, x in truth.items()}
 
 
 class Truth:
