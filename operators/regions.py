@@ -348,12 +348,12 @@ class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, NeedsPackages, NeedsPhoto
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         # the folder is what the user edits elsewhere: importing it again brings the masks up to date
-        known, active = {region.name: region for region in settings.regions}, settings.active_region
+        active = settings.active_region
         for region in regions:
-            if region.name not in known:
+            if region.name not in settings.regions:
                 add_region(settings, region.name, region.mask)
-            else:
-                set_mask(known[region.name], region.mask)
+            else:  # looked up each time: adding one moves the others
+                set_mask(settings.regions[region.name], region.mask)
         settings.active_region = active
         self.report({"INFO"}, f"{len(regions)} regions imported")
         return {"FINISHED"}

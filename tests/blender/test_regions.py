@@ -44,6 +44,22 @@ def test_merge_and_split_undo_each_other(settings, regions):
     assert {mask_of(region).sum() for region in regions} == {left.sum(), right.sum()}
 
 
+def test_importing_new_masks_with_known_ones_updates_those(regions, tmp_path):
+    """Each new region may move the others in memory before a known one gets its mask."""
+    from material_palette.core.image import write_image
+
+    more = tmp_path / "more"
+    more.mkdir()
+    masks = {name: np.zeros((96, 160), np.float32) for name in [*(f"a{i:03}" for i in range(300)), "right", "z"]}
+    for row, (name, mask) in enumerate(masks.items()):
+        mask[row % 60 : row % 60 + 30, 20:90] = 1.0
+        write_image(more / f"{name}.png", mask)
+    bpy.ops.material_palette.import_masks(directory=str(more))
+    assert [region.name for region in regions] == ["left", "right", *list(masks)[:-2], "z"]
+    for name, mask in masks.items():
+        assert (mask_of(regions[name]) == mask.astype(bool)).all()
+
+
 def test_outline_adds_takes_away_and_begins(settings, regions):
     from material_palette.operators.draw_region import apply_outline
 
