@@ -145,7 +145,7 @@ class MATERIAL_PALETTE_OT_draw_region(OverPhoto, Operator):
         self.place, usable = self.mouse(event)
         if self.shape == "POLYGON":
             return self._corner(context, event, usable)
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+        if event.type == "LEFTMOUSE" and event.value in {"PRESS", "DOUBLE_CLICK"}:
             if not usable:
                 return None
             self.points, self.drawing, self.take_away = [self.place], True, event.ctrl

@@ -27,7 +27,7 @@ def set_corners(region, corners):
 
 
 class _OverRegion(OverPhoto):
-    """Mixin: handles on the photo that belong to the active region, dragged one at a time."""
+    """Mixin: handles on the photo that belong to the region active at first, dragged one at a time."""
 
     @classmethod
     def poll(cls, context):
@@ -36,7 +36,8 @@ class _OverRegion(OverPhoto):
     def invoke(self, context, event):
         settings = context.scene.material_palette
         try:
-            self.points = self.begin(settings.regions[settings.active_region])
+            region = settings.regions[settings.active_region]
+            self.key, self.points = region.key, self.begin(region)
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -45,9 +46,13 @@ class _OverRegion(OverPhoto):
 
     def handle(self, context, event):
         place, usable = self.mouse(event)
+        region = next((r for r in context.scene.material_palette.regions if r.key == self.key), None)
+        if region is None:
+            self.report({"ERROR"}, "The region is gone")
+            return {"CANCELLED"}
         if event.type in {"RET", "NUMPAD_ENTER"} and event.value == "PRESS":
             return {"FINISHED"}
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+        if event.type == "LEFTMOUSE" and event.value in {"PRESS", "DOUBLE_CLICK"}:
             if not usable:
                 return None
             self.held = self.grab(place)
@@ -55,8 +60,7 @@ class _OverRegion(OverPhoto):
             self.points[self.held] = self.in_photo(place)
         if event.type == "LEFTMOUSE" and event.value == "RELEASE" and self.held is not None:
             self.held = None
-            settings = context.scene.material_palette
-            self.keep(settings.regions[settings.active_region])
+            self.keep(region)
             bpy.ops.ed.undo_push(message=self.bl_label)
         return {"RUNNING_MODAL"}
 

@@ -1,5 +1,7 @@
 """Corners and measures of regions as a script sets them, and corners from a camera that is matched to the photo."""
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -61,6 +63,43 @@ def test_without_a_camera_or_an_object_it_says_so(ready):
     camera.data.shift_x = 0.1
     with pytest.raises(RuntimeError, match="shifted"):
         bpy.ops.material_palette.corners_from_camera()
+
+
+class Mouse(rectify._OverRegion):
+    """Corners or measure of a region without a window: pixels of the editor are those of the photo."""
+
+    def __init__(self, region, operator):
+        self.key, self.held, self.reports = region.key, None, []
+        self.begin, self.grab, self.keep = (f.__get__(self) for f in (operator.begin, operator.grab, operator.keep))
+        self.points = self.begin(region)
+
+    bl_label = "Mouse"
+    in_photo = on_screen = staticmethod(lambda point: tuple(point))
+
+    def report(self, kind, text):
+        self.reports.append(text)
+
+    def mouse(self, event):
+        return event.place, True
+
+    def __call__(self, value, place, kind="LEFTMOUSE"):
+        return self.handle(bpy.context, SimpleNamespace(type=kind, value=value, place=place))
+
+
+@pytest.mark.parametrize("press", ["PRESS", "DOUBLE_CLICK"])
+def test_a_drag_belongs_to_the_region_that_it_began_with(ready, press):
+    first, second = ready.regions
+    rectify.set_corners(first, [[1, 1], [30, 1], [30, 20], [1, 20]])
+    mouse = Mouse(first, rectify.MATERIAL_PALETTE_OT_corners)
+    assert mouse(press, (1, 1)) == {"RUNNING_MODAL"}
+    ready.active_region = 1
+    mouse("RELEASE", (40, 40))
+    assert rectify.corners_of(first)[0].tolist() == [40, 40] and not second.has_corners
+    mouse(press, (40, 40))
+    ready.active_region = 0
+    bpy.ops.material_palette.remove_region()
+    assert mouse("RELEASE", (50, 50)) == {"CANCELLED"} and mouse.reports == ["The region is gone"]
+    assert not ready.regions[0].has_corners
 
 
 def test_corners_and_measures_reach_the_extraction(ready):
