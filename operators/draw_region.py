@@ -65,7 +65,11 @@ class OverPhoto(NeedsPackages, NeedsPhoto):
             return self.end(context, self.stop(context))
         if event.type in self._PASSED or event.type.startswith("NUMPAD"):
             return {"PASS_THROUGH"}
-        result = self.handle(context, event)
+        try:
+            result = self.handle(context, event)
+        except BaseException:
+            self.end(context, {"CANCELLED"})
+            raise
         self.region.tag_redraw()
         if result is None:
             return {"PASS_THROUGH"}
@@ -84,7 +88,8 @@ class OverPhoto(NeedsPackages, NeedsPhoto):
             self.handler = None
             context.window.cursor_modal_restore()
             context.workspace.status_text_set(None)
-            self.area.tag_redraw()
+            if self.area in list(context.window.screen.areas):
+                self.area.tag_redraw()
         return result
 
     def mouse(self, event):

@@ -143,6 +143,50 @@ def test_tools_of_the_mouse_say_that_they_need_one(settings, regions):
         bpy.ops.material_palette.draw_region(shape="BOX")
 
 
+@pytest.mark.parametrize("press", ["PRESS", "DOUBLE_CLICK"])
+def test_a_press_begins_a_box_even_as_a_double_click(press):
+    from types import SimpleNamespace
+
+    from material_palette.operators.draw_region import MATERIAL_PALETTE_OT_draw_region as Draw
+
+    tool = SimpleNamespace(shape="BOX", drawing=False, mouse=lambda event: ((3, 4), True))
+    event = SimpleNamespace(type="LEFTMOUSE", value=press, ctrl=False)
+    assert Draw.handle(tool, bpy.context, event) == {"RUNNING_MODAL"}
+    assert tool.drawing and tool.points == [(3, 4)]
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_failing_tool_of_the_mouse_leaves_nothing_behind(closed):
+    """Even where its editor was closed by what failed: Blender's object of it can't be used then."""
+    from types import SimpleNamespace
+
+    from material_palette.operators.draw_region import OverPhoto
+
+    class Area:
+        type = "IMAGE_EDITOR"
+
+        def tag_redraw(self):
+            if closed:
+                raise ReferenceError("StructRNA of type Area has been removed")
+            done.append("redraw")
+
+    class Tool(OverPhoto):
+        def handle(self, context, event):
+            if closed:
+                areas.clear()
+            raise KeyError("a bug")
+
+    done, tool = [], Tool()
+    tool.area = Area()
+    areas = [tool.area]
+    tool.handler = bpy.types.SpaceImageEditor.draw_handler_add(lambda: None, (), "WINDOW", "POST_PIXEL")
+    window = SimpleNamespace(screen=SimpleNamespace(areas=areas), cursor_modal_restore=lambda: done.append("cursor"))
+    context = SimpleNamespace(window=window, workspace=SimpleNamespace(status_text_set=lambda text: done.append(text)))
+    with pytest.raises(KeyError, match="a bug"):
+        tool.modal(context, SimpleNamespace(type="LEFTMOUSE", value="PRESS"))
+    assert tool.handler is None and done == ["cursor", None] + ["redraw"] * (not closed)
+
+
 class Layout:
     """Stands for the sidebar: refuses what Blender's would only print, and remembers what is said."""
 
