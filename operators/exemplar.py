@@ -7,10 +7,12 @@ from bpy.types import Operator
 from ..core.errors import PaletteError
 from .background import BackgroundOperator
 from .extract import light, nearest
-from .photo import photo_reader
+from .photo import photo_focal, photo_reader
+from .rectify import corners_of
 from .regions import image_editor, read_mask_image
 
 NAME = "Exemplar"  # of the image; one is used again and again
+_OURS = "material_palette_exemplar"  # custom property that tells it from the user's own images
 
 
 class MATERIAL_PALETTE_OT_preview_exemplar(BackgroundOperator, Operator):
@@ -27,7 +29,9 @@ class MATERIAL_PALETTE_OT_preview_exemplar(BackgroundOperator, Operator):
         if region.mask is not None and tuple(region.mask.size) != tuple(settings.photo.size):
             raise PaletteError(f"Region '{region.name}': its mask isn't of the photo's size; paint it anew")
         read, name, mask = photo_reader(settings.photo), region.name, read_mask_image(region)
-        chosen = light(settings)
+        chosen = light(settings) | {"rectify": settings.rectify}
+        corners, width = corners_of(region), settings.photo.size[0]
+        focal = settings.focal_length / 36.0 or photo_focal(settings.photo)
 
         def work(progress, send):
             progress(0.0, "Reading the photo")
@@ -36,16 +40,19 @@ class MATERIAL_PALETTE_OT_preview_exemplar(BackgroundOperator, Operator):
 
             pixels, _warnings = read()
             region = Region(name, nearest(mask, pixels.shape[:2]))
-            return preview_exemplar(pixels, region, Settings(**chosen), progress)
+            if corners is not None:
+                region.corners = corners * (pixels.shape[1] / width)
+            return preview_exemplar(pixels, region, Settings(**chosen), progress, focal and focal * max(pixels.shape))
 
         return work
 
     def finish(self, context, scene, result):
         picture, warnings = result
         height, width = picture.shape[:2]
-        image = bpy.data.images.get(NAME)
-        if image is None or image.source != "GENERATED":
+        image = next((image for image in bpy.data.images if image.get(_OURS) and image.source == "GENERATED"), None)
+        if image is None:
             image = bpy.data.images.new(NAME, width, height)
+            image[_OURS] = True
         elif tuple(image.size) != (width, height):
             image.scale(width, height)
         rgba = np.ones((height, width, 4), np.float32)
