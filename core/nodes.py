@@ -122,14 +122,14 @@ def images_of(material):
     return list(dict.fromkeys(image for image in images if image is not None))
 
 
-def move_files(material, old, new):
-    """Point the images of `material` to the folder `new` where they lay in `old`; the files are there already."""
+def unpack(material, folder):
+    """Let the images that `build_material` has packed refer to their files, which lie in `folder`."""
     for image in images_of(material):
-        path = Path(bpy.path.abspath(image.filepath_raw))
-        if path.is_relative_to(old):
-            image.filepath_raw = _relative(str(Path(new) / path.relative_to(old)))
-            if not image.has_data:
-                image.reload()
+        path = Path(folder) / image.filepath_raw.removeprefix("//")
+        if image.packed_file and path.is_file():
+            image.unpack(method="REMOVE")
+            image.filepath_raw = _relative(str(path))
+            image.reload()
 
 
 def remove_material(material):

@@ -15,7 +15,7 @@ from bpy.types import Operator
 from ..core.errors import Abandoned, Cancelled, PaletteError, explain
 from . import history
 from .background import BackgroundOperator
-from .palette import active_entry, put_in_palette, region_of
+from .palette import active_entry, drop_before, put_in_palette, region_of
 from .photo import photo_focal, photo_reader
 from .preferences import decomposer, diffusion_settings
 from .rectify import corners_of, measure_of
@@ -83,24 +83,25 @@ class _Extracts(BackgroundOperator):
         return lambda progress, send: _work(order, progress, send)
 
     def receive(self, context, scene, made):
-        # what can't be built now, as when the files are on their way to their folder, is built or named at the end
+        # what can't be built now, as when the files are on their way to their folder, is built or named at the end;
+        # packed until then, since the files may yet be taken back
         with contextlib.suppress(Exception):
-            self._take(scene.material_palette, made)
+            self._take(scene.material_palette, made, pack=True)
 
-    def _take(self, settings, made):
+    def _take(self, settings, made, pack):
         """Put the material of `made` into the palette unless it is there: undo may have taken it back meanwhile."""
         from ..core import nodes
 
         if made.record["status"] != "ok" or self.built.get(made.key) in {m.session_uid for m in bpy.data.materials}:
             return
-        material = nodes.build_material(made.record, made.folder, pack=self.pack, preview=made.preview)
+        material = nodes.build_material(made.record, made.folder, pack=pack, preview=made.preview)
         try:
             nodes.mark_asset(material, self.description, settings.author, settings.licence)
         except BaseException:
             nodes.remove_material(material)
             raise
         _keep_concept(material, made, self.kept)
-        entry = put_in_palette(settings, made.key, material, not self.replaces_files)
+        entry = put_in_palette(settings, made.key, material)
         entry.name = made.record["name"]
         entry.seed = self.chosen["seed"]
         entry.warnings = "\n".join([*made.record["warnings"], *_target(made.record)])
@@ -110,18 +111,21 @@ class _Extracts(BackgroundOperator):
         from ..core import nodes
 
         settings = scene.material_palette
-        for material in bpy.data.materials:
-            if material.session_uid in self.built.values():
-                nodes.move_files(material, result.staging, result.folder)
+        if not self.pack:
+            for material in bpy.data.materials:
+                if material.session_uid in self.built.values():
+                    nodes.unpack(material, result.folder)
         for made in result.made:
             made.folder = result.folder
             try:
-                self._take(settings, made)
+                self._take(settings, made, self.pack)
             except Exception as error:
                 made.record |= {"status": "failed", "error": explain(error)}
             region = region_of(settings, made.key)
             if region is not None:
                 region.error = made.record["error"] or ""
+        if self.replaces_files:  # those of the materials before
+            drop_before(settings, self.built)
         failed = [made.record for made in result.made if made.record["status"] != "ok"]
         if len(failed) == len(result.made):
             raise PaletteError("No material was made. " + _say(failed))
@@ -379,7 +383,7 @@ def _resample(kept, key, chosen, folder, tempdir, progress, send):
         send(made)
         if folder:
             palette = Palette(None, "a kept concept", [], settings, [material])
-            write_palette(palette, staging, progress, {record["name"]: record})
+            write_palette(palette, staging, _to_the_end(progress), {record["name"]: record})
     return _Extracted([made], folder or staging, staging, folder is None)
 
 
@@ -441,13 +445,22 @@ def _extract(order, pixels, regions, settings, progress, send, staging):
         palette = Palette(pixels, order.photo_name, regions[: len(materials)], settings, materials)
     if order.folder:
         palette.warnings[:0] = order.warnings
-
-        def writing(fraction, message):
-            if not cancelled:
-                progress(_EXTRACTION + (1.0 - _EXTRACTION) * fraction, message)
-
-        write_palette(palette, staging, writing, {one.record["name"]: one.record for one in made})
+        write_palette(palette, staging, _to_the_end(progress), {one.record["name"]: one.record for one in made})
     return made, cancelled
+
+
+def _to_the_end(progress):
+    """Progress of the writing: what is finished is kept, so that a cancel doesn't stop it; Abandoned does."""
+
+    def writing(fraction, message):
+        try:
+            progress(_EXTRACTION + (1.0 - _EXTRACTION) * fraction, message)
+        except Abandoned:
+            raise
+        except Cancelled:
+            pass
+
+    return writing
 
 
 def nearest(mask, shape):

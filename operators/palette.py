@@ -72,6 +72,15 @@ def _drop_before(entry):
         nodes.remove_material(old)
 
 
+def drop_before(settings, built):
+    """Delete the materials before those of `built` ({region key: session_uid}), whose files were replaced."""
+    from ..core import nodes
+
+    for entry in settings.palette:
+        if entry.previous and entry.material and entry.material.session_uid == built.get(entry.key):
+            nodes.remove_material(entry.previous)
+
+
 class NeedsMaterial:
     @classmethod
     def poll(cls, context):

@@ -199,6 +199,11 @@ def test_extract_into_a_folder(ready, instant, tmp_path):
     assert "isn't empty" in refused(bpy.ops.material_palette.extract)
     settings.overwrite = True
     assert bpy.ops.material_palette.extract() == {"FINISHED"}
+    assert sorted(material.name for material in bpy.data.materials) == [
+        "left",
+        "right",
+    ]  # of the others no file is left
+    assert not any(image.packed_file for entry in settings.palette for image in images_in(entry.material))
 
 
 def test_extracting_again_puts_the_new_material_where_the_old_one_was(ready, instant):
@@ -572,6 +577,53 @@ def test_cancel_into_a_folder_writes_what_is_finished(stepwise, ready, tmp_path)
     ]
     for image in (node.image for node in ready.palette[0].material.node_tree.nodes if hasattr(node, "image")):
         assert Path(image.filepath_raw).is_file()
+
+
+def textures_of(settings):
+    """{name: whether it is packed or its file is there} of the pictures of the palette's materials."""
+    images = [image for entry in settings.palette for image in images_in(entry.material)]
+    return {i.name: bool(i.packed_file) or Path(bpy.path.abspath(i.filepath_raw)).is_file() for i in images}
+
+
+def test_cancel_while_a_folder_is_written_keeps_all(ready, instant, tmp_path, monkeypatch):
+    from material_palette.core import sheet
+    from material_palette.operators import background
+
+    draw = sheet.contact_sheet
+
+    def cancelled(palette):
+        background.cancel()
+        return draw(palette)
+
+    monkeypatch.setattr(sheet, "contact_sheet", cancelled)
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    assert drain(Modal().start()) == {"FINISHED"}
+    assert (tmp_path / "out" / "palette.json").is_file()
+    assert textures_of(ready) == {"left_basecolor": True, "right_basecolor": True}
+
+
+def test_a_folder_that_fails_at_the_end_leaves_materials_whole(ready, instant, tmp_path):
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    bpy.ops.material_palette.extract()
+    old = [entry.material for entry in ready.palette]
+    (tmp_path / "out" / "mine").mkdir()
+    (tmp_path / "out" / "mine" / "mine_basecolor.png").write_bytes(b"a file of the user's")
+    ready.regions[0].name, ready.overwrite = "mine", True
+    operator = Modal().start()
+    assert drain(operator) == {"CANCELLED"} and "in the way" in operator.reports[-1]
+    assert all(textures_of(ready).values())
+    for entry, before in zip(ready.palette, old, strict=True):
+        assert before in (entry.material, entry.previous)
+        assert all(Path(image.filepath_raw).is_file() for image in images_in(before))
+
+
+def test_a_run_that_is_stopped_leaves_materials_whole(stepwise, ready, tmp_path):
+    from material_palette.operators import background
+
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    stepwise()
+    background.stop()
+    assert textures_of(ready) == {"left_basecolor": True} and not (tmp_path / "out").exists()
 
 
 def test_undo_during_a_run_loses_nothing_of_it(stepwise, ready):
