@@ -60,10 +60,15 @@ class MATERIAL_PALETTE_OT_export(_ExportsPalette, Operator):
         from ..core.region import file_name
 
         folder = Path(bpy.path.abspath(self.directory))
-        materials = self.materials(context)
+        materials, owners = self.materials(context), {}
         try:
             if not folder.is_dir():
                 raise PaletteError(f"No such folder: {folder}")
+            for material in materials:
+                owner = owners.setdefault(file_name(material.name).casefold(), material)
+                if owner != material:
+                    one, other = owner.name, material.name
+                    raise PaletteError(f"Materials '{one}' and '{other}' would share one file name; rename one")
             for material in materials:
                 self._write(material, file_name(material.name), folder)
         except (PaletteError, OSError) as error:

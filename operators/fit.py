@@ -21,7 +21,7 @@ FITTED = "palette_fitted"  # custom property of a material that this has made
 
 @dataclass
 class _Fitted:
-    """What the worker hands over: the folder of the maps, and per entry its key, record and preview."""
+    """What the worker hands over: the folder of the entries' folders, and per entry its key, record and preview."""
 
     folder: Path
     made: list
@@ -102,7 +102,7 @@ class MATERIAL_PALETTE_OT_fit_scene(BackgroundOperator, Operator):
             asset = full.asset_data
             told = (asset.description, asset.author, asset.license) if asset else None
             before = _bytes(full)
-            material = nodes.build_material(record, result.folder, pack=True, preview=preview)
+            material = nodes.build_material(record, result.folder / str(key), pack=True, preview=preview)
             material[FITTED] = True
             _share(material, full)
             put_in_palette(settings, key, material, self.keep_full)
@@ -216,7 +216,9 @@ def _work(order, temporary, progress):
                 pixels *= again.metres_per_tile / one.metres
                 material.svbrdf, material.metres_per_tile = again.svbrdf, again.metres_per_tile
             fit_material(material, pixels, share, one.seen.displaced)
-            made.append((one.key, write_material(material, folder / file_name(one.name)), material.preview))
+            # by key, since names may share a file name
+            record = write_material(material, folder / str(one.key) / file_name(one.name))
+            made.append((one.key, record, material.preview))
         return _Fitted(folder, made)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

@@ -59,6 +59,17 @@ def test_a_material_taken_apart_is_refused_by_name(stone, tmp_path):
         bpy.ops.material_palette.export(directory=str(tmp_path))
 
 
+def test_names_that_share_a_file_name_are_refused(stone, settings, tmp_path, make_record):
+    stone.name = "wall:1"
+    other = nodes.build_material(make_record(), tmp_path, pack=False)
+    other.name = "Wall_1"
+    put_in_palette(settings, 2, other)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(RuntimeError, match="'wall:1' and 'Wall_1'"):
+        bpy.ops.material_palette.export(directory=str(tmp_path / "out"))
+    assert not any((tmp_path / "out").iterdir())
+
+
 @pytest.fixture
 def library(tmp_path):
     folder = tmp_path / "library"

@@ -3,6 +3,7 @@
 import json
 
 import bpy
+import cv2
 import numpy as np
 import pytest
 from material_palette.core.material import SVBRDF
@@ -69,6 +70,18 @@ def test_seen_materials_get_what_the_camera_shows_and_unseen_ones_the_least(pale
     assert bpy.data.objects["wall"].data.materials[0] == stone
     assert all(image.packed_file for image in bpy.data.images if image.users)
     assert side(palette[0].previous) == SIDE
+
+
+def test_materials_whose_names_share_a_file_name_stay_apart(palette):
+    stone, grain = (entry.material for entry in palette)
+    stone.name, grain.name = "wall:1", "wall_1"
+    plane("sign", grain, 1.0, 1.0)
+    bpy.ops.material_palette.fit_scene()
+    for entry, full in zip(palette, (stone, grain), strict=True):
+        images = (material.node_tree.nodes["Palette Base Color"].image for material in (entry.material, full))
+        fitted, whole = (np.array(image.pixels[:]).reshape(image.size[0], -1, 4)[:, :, 0] for image in images)
+        shrunk = cv2.resize(whole, fitted.shape, interpolation=cv2.INTER_AREA)
+        assert np.corrcoef(shrunk.ravel(), fitted.ravel())[0, 1] > 0.8
 
 
 def test_full_materials_come_back(palette):
