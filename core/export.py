@@ -30,12 +30,14 @@ def adjust_normal(normal: np.ndarray, strength: float, rotation: float) -> np.nd
     return turned / np.linalg.norm(turned, axis=-1, keepdims=True)
 
 
-def write_gltf_maps(folder: Path, name: str, maps: dict) -> list[str]:
+def write_gltf_maps(folder: Path, name: str, maps: dict, bits: dict | None = None) -> list[str]:
     """Write glTF's set of a material into `folder`; return the names of its files.
 
     maps: "basecolor" (H, W, 3) linear or (3,), "normal" (H, W, 3) or None, "roughness" and "metallic" (H, W) or float.
-    `<name>_orm.png` holds occlusion (none: 1), roughness and metallic in red, green and blue.
+    bits: those of a map where they aren't 8. `<name>_orm.png` holds occlusion (none: 1), roughness and metallic in red,
+    green and blue.
     """
+    bits = {"basecolor": 8, "normal": 8, "roughness": 8} | (bits or {})
     shapes = [value.shape[:2] for kind, value in maps.items() if np.ndim(value) > 1 and kind != "height"]
     height, width = max(shapes) if shapes else (4, 4)
 
@@ -53,7 +55,8 @@ def write_gltf_maps(folder: Path, name: str, maps: dict) -> list[str]:
     if maps.get("normal") is not None:
         pictures["normal"] = (maps["normal"] + 1) / 2
     for kind, picture in pictures.items():
-        write_image(folder / f"{name}_{kind}.png", np.ascontiguousarray(picture, dtype=np.float32))
+        depth = bits["roughness" if kind == "orm" else kind]
+        write_image(folder / f"{name}_{kind}.png", np.ascontiguousarray(picture, dtype=np.float32), depth)
     return [f"{name}_{kind}.png" for kind in pictures]
 
 

@@ -80,20 +80,32 @@ class MATERIAL_PALETTE_OT_export(_ExportsPalette, Operator):
     def _write(self, material, name, folder):
         from ..core import export
         from ..core.image import srgb_from_linear, write_image
+        from ..core.nodes import Controls
 
         maps, tile_size, rotation, relief = adjusted_maps(material)
+        controls = Controls(material)
+        nodes = {kind: controls.node(kind) for kind in ("basecolor", "normal", "roughness")}
+        # Blender has floats of more than 8 bits
+        bits = {kind: 16 if node and node.image and node.image.is_float else 8 for kind, node in nodes.items()}
+        bits["height"] = 16
         folder = folder / name
         folder.mkdir(exist_ok=True)
         if self.gltf:
-            export.write_gltf_maps(folder, name, maps)
+            straight = {}
+            if maps["normal"] is not None:  # the pictures of this set aren't turned
+                straight["normal"] = export.adjust_normal(maps["normal"], 1.0, -rotation)
+            export.write_gltf_maps(folder, name, maps | straight, bits)
         if self.materialx:
+            # the relief is told once, as the material has it
+            maps["height" if controls.relief == "NORMAL" else "normal"] = None
             listed = dict(maps) | {"height_scale": relief}
             for kind, value in maps.items():
                 if np.ndim(value) < 2:
                     continue
                 encoded = {"basecolor": lambda v: np.clip(srgb_from_linear(v), 0, 1), "normal": lambda v: (v + 1) / 2}
-                listed[kind] = f"{name}_{kind}.png"
-                write_image(folder / listed[kind], encoded.get(kind, lambda v: v)(value), 16 if kind == "height" else 8)
+                turned = "_turned" if kind == "normal" and rotation else ""
+                listed[kind] = f"{name}_{kind}{turned}.png"
+                write_image(folder / listed[kind], encoded.get(kind, lambda v: v)(value), bits[kind])
             export.write_materialx(folder / f"{name}.mtlx", name, listed, tile_size, rotation)
 
 

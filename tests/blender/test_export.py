@@ -23,7 +23,7 @@ def test_files_have_the_adjustments_in_them(stone, tmp_path):
     stone.material_palette.roughness_offset = 0.2
     assert bpy.ops.material_palette.export(directory=str(out)) == {"FINISHED"}
     written = {path.name for path in (out / "stone").iterdir()}
-    kinds = ("basecolor", "normal", "roughness", "height", "orm")
+    kinds = ("basecolor", "normal", "roughness", "orm")
     assert written == {"stone.mtlx", *(f"stone_{kind}.png" for kind in kinds)}
 
     def linear(path):
@@ -51,6 +51,50 @@ def test_a_base_colour_of_16_bits_is_the_same_colour(settings, tmp_path, make_re
         read.append(read_map(nodes.Controls(material).node("basecolor").image))
     np.testing.assert_allclose(read[0], read[1], atol=1e-4)
     assert read[0].max() > 1.2 * read[0].mean()
+
+
+def test_materialx_tells_of_the_relief_once(stone, tmp_path):
+    for relief, kind in (("NORMAL", "normal"), ("BUMP", "height"), ("DISPLACEMENT", "height")):
+        nodes.Controls(stone).relief = relief
+        out = tmp_path / relief
+        out.mkdir()
+        bpy.ops.material_palette.export(directory=str(out), gltf=False)
+        document = (out / "stone" / "stone.mtlx").read_text()
+        assert [k for k in ("normal", "height") if f"stone_{k}.png" in document] == [kind]
+        assert ("displacementshader" in document) == (kind == "height")
+
+
+def test_normals_turn_with_materialx_and_not_with_gltf(stone, tmp_path):
+    nodes.Controls(stone).rotation = np.pi / 2
+    out = tmp_path / "out"
+    out.mkdir()
+    bpy.ops.material_palette.export(directory=str(out))
+
+    def normals(path):
+        vectors = cv2.imread(str(path))[..., ::-1] / 127.5 - 1
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+    before = normals(tmp_path / "stone" / "stone_normal.png")
+    up = before[..., 2] > 0.1
+    np.testing.assert_allclose(normals(out / "stone" / "stone_normal.png")[up], before[up], atol=0.03)
+    turned = np.stack([before[..., 1], -before[..., 0], before[..., 2]], -1)
+    np.testing.assert_allclose(normals(out / "stone" / "stone_normal_turned.png")[up], turned[up], atol=0.03)
+    assert "stone_normal_turned.png" in (out / "stone" / "stone.mtlx").read_text()
+
+
+@pytest.mark.parametrize("formats", [{"gltf": False}, {"materialx": False}])
+def test_maps_of_16_bits_stay_so(settings, tmp_path, make_record, write_maps, formats):
+    record = make_record(write_maps())
+    for kind in ("normal", "roughness"):
+        path = str(tmp_path / "stone" / f"stone_{kind}.png")
+        cv2.imwrite(path, cv2.imread(path, cv2.IMREAD_UNCHANGED).astype(np.uint16) * 257)
+    put_in_palette(settings, 1, nodes.build_material(record, tmp_path, pack=True))
+    out = tmp_path / "out"
+    out.mkdir()
+    bpy.ops.material_palette.export(directory=str(out), **formats)
+    read = {path.stem[6:]: cv2.imread(str(path), cv2.IMREAD_UNCHANGED).dtype for path in out.rglob("*.png")}
+    rough = "roughness" if "gltf" in formats else "orm"
+    assert read == {"basecolor": np.uint8, "normal": np.uint16, rough: np.uint16}
 
 
 def test_a_material_taken_apart_is_refused_by_name(stone, tmp_path):
