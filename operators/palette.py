@@ -49,8 +49,11 @@ def adopt_adjustments(material, old):
     if not (Controls(old) and Controls(material)):
         return
     values = Controls(old).values()
-    if values.get("tile_size") and abs(values["tile_size"] / old.get("metres_per_tile", 1.0) - 1.0) < 1e-4:
+    extracted, now = (m.get("metres_per_tile", 1.0) for m in (old, material))
+    if values.get("tile_size") and abs(values["tile_size"] / extracted - 1.0) < 1e-4:
         del values["tile_size"]  # as extracted then; now as extracted now
+    elif values.get("tile_size"):
+        values["tile_size"] *= now / extracted
     Controls(material).set(values)
 
 
@@ -58,6 +61,7 @@ def take_place(material, old):
     """`material` stands wherever `old` did, under its name."""
     name = old.name
     old.user_remap(material)
+    material.name = "Material Palette stand-in"  # it may have the name that the other gets
     old.name = f"{name} (before)"
     material.name = name
     if old.asset_data is not None:

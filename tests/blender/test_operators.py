@@ -252,11 +252,24 @@ def test_a_variation_has_another_seed_and_can_be_compared(ready, instant, data_b
         bpy.ops.material_palette.compare()
         assert wall.materials[0] == ready.palette[1].material == expected
         assert expected.name == "right" and expected.asset_data is not None
+        assert ready.palette[1].previous.name == "right (before)"
     bpy.ops.material_palette.discard_before()
     after = data_blocks()
     assert after["materials"] == before["materials"] and len(after["images"]) == len(before["images"])
     ready.regions.clear()
     assert not bpy.ops.material_palette.vary.poll()
+
+
+def test_an_adjusted_tile_follows_what_the_new_one_covers(tmp_path, make_record, write_maps):
+    from material_palette.core.nodes import Controls, build_material
+    from material_palette.operators.palette import adopt_adjustments
+
+    maps = write_maps()
+    old, new = (build_material(make_record(maps, metres_per_tile=m), tmp_path, pack=True) for m in (1.0, 2.0))
+    for tile_size, expected in ((1.0, 2.0), (1.5, 3.0)):
+        Controls(old).tile_size = tile_size
+        adopt_adjustments(new, old)
+        assert Controls(new).tile_size == pytest.approx(expected)
 
 
 def test_a_kept_concept_is_sampled_again_without_the_photo(ready, tmp_path, temporary_folders):
