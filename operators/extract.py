@@ -445,6 +445,7 @@ def _extract(order, pixels, regions, settings, progress, send, staging):
         palette = Palette(pixels, order.photo_name, regions[: len(materials)], settings, materials)
     if order.folder:
         palette.warnings[:0] = order.warnings
+        palette.scale = pixels.shape[1] / order.size[0]
         write_palette(palette, staging, _to_the_end(progress), {one.record["name"]: one.record for one in made})
     return made, cancelled
 

@@ -348,6 +348,41 @@ def test_choosing_a_material_chooses_its_region(ready, instant):
     assert (ready.active_material, ready.active_region) == (0, 0)
 
 
+def test_progress_of_a_resample_into_a_folder_never_steps_back(tmp_path, monkeypatch):
+    from material_palette.core import palette
+    from material_palette.core.material import SVBRDF
+    from material_palette.operators import extract
+
+    def sample(_path, _settings, progress):
+        progress(1.0, "done")
+        svbrdf = SVBRDF(np.full(3, 0.5, np.float32), np.array([0, 0, 1], np.float32), 0.6)
+        return palette.Material("stone", svbrdf=svbrdf, preview=np.ones((256, 256, 4), np.float32))
+
+    monkeypatch.setattr(palette, "resample_material", sample)
+    chosen = {"quality": "draft", "resolution": 64, "scale": 1.0, "seed": 0, "decomposer": "unet"}
+    told = []
+    kept = "{}", ""
+    extract._resample(kept, 1, chosen, tmp_path / "out", str(tmp_path), lambda f, _m: told.append(f), lambda made: None)
+    assert told == sorted(told) and told[-1] == 1.0
+
+
+def test_geometry_is_written_in_px_of_the_photo_not_of_the_reduced_one(ready, instant, tmp_path, monkeypatch):
+    import json
+
+    from material_palette.core.image import read_photo
+    from material_palette.operators import extract
+
+    photo = ready.photo.filepath_raw
+    half = np.ascontiguousarray(read_photo(photo).pixels[::2, ::2])
+    monkeypatch.setattr(extract, "photo_reader", lambda image: lambda: (half, []))
+    corners = [[10, 10], [60, 12], [58, 70], [12, 68]]
+    monkeypatch.setattr(extract, "corners_of", lambda region: np.float64(corners) if region.name == "left" else None)
+    ready.pack, ready.output_folder = False, str(tmp_path / "out")
+    bpy.ops.material_palette.extract()
+    (written,) = (tmp_path / "out" / "masks").glob("*.json")
+    assert np.allclose(json.loads(written.read_text())["left"]["corners"], corners, atol=1.0)
+
+
 def test_a_variation_into_a_folder_leaves_the_other_textures(ready, instant, tmp_path):
     ready.pack, ready.output_folder = False, str(tmp_path / "out")
     bpy.ops.material_palette.extract()
