@@ -197,7 +197,7 @@ class MATERIAL_PALETTE_OT_vary(_Extracts, Operator):
         return [region_of(settings, active_entry(settings).key)]
 
     def seed(self, context):
-        return active_entry(context.scene.material_palette).seed + 1
+        return _next(active_entry(context.scene.material_palette).seed)
 
 
 class MATERIAL_PALETTE_OT_resample(_Extracts, Operator):
@@ -229,10 +229,14 @@ class MATERIAL_PALETTE_OT_resample(_Extracts, Operator):
         self.kept = entry.material.material_palette.concept, entry.material.material_palette.concept_tensors
         asset = entry.material.asset_data
         self.description = asset.description if asset else ""
-        self.chosen = sampling(settings, entry.seed + self.variation)
+        self.chosen = sampling(settings, _next(entry.seed) if self.variation else entry.seed)
         folder = None if settings.pack else _unused(_output_folder(settings))
         work = self.kept, entry.key, self.chosen, folder, bpy.app.tempdir
         return lambda progress, send: _resample(*work, progress, send)
+
+
+def _next(seed):
+    return (seed + 1) % 2**31  # what an IntProperty holds
 
 
 def _target(record):

@@ -272,6 +272,13 @@ def test_an_adjusted_tile_follows_what_the_new_one_covers(tmp_path, make_record,
         assert Controls(new).tile_size == pytest.approx(expected)
 
 
+def test_after_the_last_seed_comes_the_first(ready, instant):
+    ready.seed = 2**31 - 1
+    bpy.ops.material_palette.extract()
+    assert bpy.ops.material_palette.vary() == {"FINISHED"}
+    assert ready.palette[0].seed == 0
+
+
 def test_a_kept_concept_is_sampled_again_without_the_photo(ready, tmp_path, temporary_folders):
     ready.regions[0].enabled, ready.keep_concepts, ready.seed = False, True, 3
     bpy.ops.material_palette.extract()
