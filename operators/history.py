@@ -15,7 +15,8 @@ def add(chosen, records):
     for record in records:
         if "sample" in record["seconds"]:  # a constant material says nothing of the engine
             history.append(
-                {key: chosen[key] for key in ("engine", "quality", "resolution")}
+                {key: chosen[key] for key in ("engine", "quality")}
+                | {"resolution": _sampled(chosen["resolution"], chosen["scale"])}
                 | {"seconds": sum(record["seconds"].values())}
             )
     pace.remember(_path(), history)
@@ -23,7 +24,7 @@ def add(chosen, records):
 
 def expected(settings, quality, regions):
     """Seconds that extracting so many regions will take with a scene's settings; None while nothing is known."""
-    return pace.expected(_load(), settings.engine, quality, settings.resolution, regions)
+    return pace.expected(_load(), settings.engine, quality, _sampled(settings.resolution, settings.scale), regions)
 
 
 def count():
@@ -45,6 +46,11 @@ def clear():
 def forget():
     global _history
     _history = None
+
+
+def _sampled(resolution, scale):
+    """Side in px of the texture that is made, as `core.palette.Settings.sampled`."""
+    return round(resolution / scale)
 
 
 def _load():

@@ -355,6 +355,19 @@ def test_choosing_a_material_chooses_its_region(ready, instant):
     assert (ready.active_material, ready.active_region) == (0, 0)
 
 
+def test_a_forecast_counts_what_is_sampled(settings):
+    from material_palette.operators import history
+
+    history.clear()
+    chosen = {"engine": "patch", "quality": "balanced", "resolution": 2048, "scale": 4.0}
+    history.add(chosen, [{"seconds": {"sample": 3.0}}])
+    settings.resolution = 512
+    assert history.expected(settings, "balanced", 2) == pytest.approx(6.0)
+    settings.resolution, settings.scale = 1024, 2.0
+    assert history.expected(settings, "balanced", 2) == pytest.approx(6.0)
+    history.clear()
+
+
 def test_progress_of_a_resample_into_a_folder_never_steps_back(tmp_path, monkeypatch):
     from material_palette.core import palette
     from material_palette.core.material import SVBRDF
