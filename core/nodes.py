@@ -5,6 +5,7 @@ socket's value and no node. `Controls` changes a material afterwards by its node
 node. Everything runs on Blender's main thread.
 """
 
+import os
 from pathlib import Path
 
 import bpy
@@ -368,7 +369,13 @@ def add_catalogue(folder):
     path = Path(folder) / "blender_assets.cats.txt"
     text = path.read_text(encoding="utf-8") if path.is_file() else "VERSION 1\n\n"
     if CATALOG_ID not in text:
-        path.write_text(f"{text.rstrip()}\n\n{CATALOG_ID}:{CATALOG_NAME}:{CATALOG_NAME}\n", encoding="utf-8")
+        part = path.with_name(f".{path.name}.part")  # a full disk must not take the user's catalogues
+        try:
+            part.write_text(f"{text.rstrip()}\n\n{CATALOG_ID}:{CATALOG_NAME}:{CATALOG_NAME}\n", encoding="utf-8")
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
 
 
 class _names_free:

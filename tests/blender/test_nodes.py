@@ -327,6 +327,21 @@ def test_catalogue_file_names_the_assets_catalogue(tmp_path, make_record):
     assert f"{nodes.CATALOG_ID}:Material Palette:Material Palette" in lines
 
 
+def test_a_catalogue_file_that_can_not_be_written_stays_as_it_was(tmp_path, monkeypatch):
+    path = tmp_path / "blender_assets.cats.txt"
+    text = "VERSION 1\n\n11111111-2222-3333-4444-555555555555:Mine:Mine\n"
+    path.write_text(text)
+
+    def full(self, *_content, **_how):
+        self.write_bytes(b"VERS")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(path), "write_text", full)
+    with pytest.raises(OSError, match="No space"):
+        nodes.add_catalogue(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name] and path.read_text() == text
+
+
 def test_a_failing_write_leaves_the_open_file_as_it_was(tmp_path, make_record, write_maps, data_blocks):
     palette = palette_of(make_record(name="paint"), make_record(write_maps()))
     (tmp_path / "stone" / "stone_normal.png").unlink()
