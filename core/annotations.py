@@ -8,7 +8,7 @@ import numpy as np
 
 from .errors import PaletteError
 from .image import read_codes
-from .region import Region
+from .region import Region, check_names
 
 MOST_CODES = 64  # more colours than that are a picture, or borders that were smoothed
 
@@ -19,13 +19,15 @@ def read_annotations(path: str | Path, shape: tuple[int, int], photo_name: str =
     .json: COCO; one region per category, of all its annotations, or per annotation where there are no categories (the
     lists that Segment Anything's tools write). `photo_name` chooses among several images, by file name.
     Any other: an image in which each colour or index but black and transparent is a region.
-    Raises PaletteError for what can't be read, and when there is no region.
+    Raises PaletteError for what can't be read, when there is no region and for two of one file name.
     """
     path = Path(path)
     found = _coco(path, shape, photo_name) if path.suffix.lower() == ".json" else _coded(path, shape)
     if not found:
         raise PaletteError(f"'{path}' holds no region.")
-    return [Region(name, found[name]) for name in sorted(found)]
+    regions = [Region(name, found[name]) for name in sorted(found)]
+    check_names(regions)
+    return regions
 
 
 def _coded(path: Path, shape: tuple[int, int]) -> dict[str, np.ndarray]:

@@ -10,9 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from .errors import PaletteError
-from .region import file_name
+from .region import PALETTE_FILES, file_name
 
-PALETTE_FILES = ("palette.json", "palette.png", "palette.blend", "blender_assets.cats.txt")
 MAPS = ("basecolor", "normal", "roughness", "height", "metallic")
 DESKTOP_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # a file browser leaves them; the folder counts as empty
 FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))

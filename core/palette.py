@@ -28,7 +28,7 @@ from .image import linear_from_srgb, srgb_from_linear, write_image
 from .mask import without_strays
 from .material import SVBRDF
 from .perceptual import Crops
-from .region import GEOMETRY, Region, check_region, file_name, region_geometry
+from .region import EXEMPLARS, GEOMETRY, Region, check_names, check_region, file_name, region_geometry
 from .sides import largest_side, same_hue
 from .tensors import read_tensors, write_tensors
 from .torus import resize
@@ -44,7 +44,6 @@ PREVIEW = 256  # px
 LEAST_FITTED = 16  # px
 HEIGHTS_PER_PIXEL = 2.0  # of a picture, where the relief is displaced
 LARGEST_ABREAST = 2048  # px: larger materials are finished one by one, for memory
-EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
 
 Progress = Callable[[float, str], None]
 
@@ -186,11 +185,12 @@ def extract_palette(
     A region that cannot be extracted becomes a material with status "failed"; the others are finished. on_material is
     called with each material as soon as it is done, in their order but on another thread, as progress may be. focal is
     the photo's focal length in px where it is known. progress may raise Cancelled, which ends the call.
-    Raises PaletteError for settings that cannot be honoured and when there is no region.
+    Raises PaletteError for settings that cannot be honoured, when there is no region and for two of one file name.
     """
     settings.check()
     if not regions:
         raise PaletteError("there is no region; paint one or choose automatic segmentation")
+    check_names(regions)
     start = time.perf_counter()
     engine = engines.open_engine(settings.engine, settings.diffusion)
     palette = Palette(pixels, photo_name, regions, settings, [])

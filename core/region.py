@@ -14,6 +14,9 @@ from .image import read_mask
 
 LEAST_AREA = 24 * 24  # px
 LEAST_RADIUS = 3  # px of the largest disc inside; below it no neighbourhood lies within the region
+PALETTE_FILES = ("palette.json", "palette.png", "palette.blend", "blender_assets.cats.txt")
+EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside masks
+RESERVED = {"masks", EXEMPLARS, *PALETTE_FILES}  # beside the materials' folders
 GEOMETRY = "regions.json"  # beside the masks: corners and measures by region
 LONGEST_FILE_NAME = 100  # bytes; leaves room for suffixes and folders within what Windows takes
 MASK_SUFFIXES = frozenset(
@@ -158,6 +161,17 @@ def _metres(value: str | float, text: str, usage: str) -> float:
     return metres
 
 
+def check_names(regions: list[Region]) -> None:
+    """Raise PaletteError for two regions whose files of maps would have one name on some system."""
+    owners = {}
+    for region in regions:
+        owner = owners.setdefault(file_name(region.name).casefold(), region)
+        if owner is not region:
+            raise PaletteError(
+                f"Regions '{owner.name}' and '{region.name}' would name one material. Rename or remove one."
+            )
+
+
 def check_region(region: Region) -> None:
     """Raise PaletteError when a region is empty or too small to hold a texture, with its size and the least."""
     area = int(np.count_nonzero(region.mask))
@@ -200,11 +214,14 @@ def _readable(stem: str) -> str:
 
 
 def file_name(name: str) -> str:
-    """A region's name as a file name on Linux, macOS and Windows; letters of any script stay as they are."""
+    """A region's name as a file name on Linux, macOS and Windows; letters of any script stay as they are. None of
+    RESERVED."""
     clean = unicodedata.normalize("NFC", name)
     clean = "".join("_" if c in '<>:"/\\|?*' or unicodedata.category(c)[0] == "C" else c for c in clean)
     clean = clean.encode("utf-8")[:LONGEST_FILE_NAME].decode("utf-8", "ignore")
     clean = clean.strip(" ").lstrip(".").rstrip(" .").strip(" ")
     if WINDOWS_DEVICE.match(clean):
         clean = "_" + clean
+    if clean.casefold() in RESERVED:
+        clean += "_"
     return clean or "region"

@@ -148,6 +148,15 @@ def test_damaged_json_is_named(tmp_path, content):
         read_annotations(write(tmp_path / "coco.json", content), SHAPE)
 
 
+def test_categories_of_one_file_name_are_refused(tmp_path):
+    content = {
+        "categories": [{"id": 1, "name": "a/b"}, {"id": 2, "name": "A_b"}],
+        "annotations": [{"category_id": n, "segmentation": [[0, 0, 9, 0, 9, 9]]} for n in (1, 2)],
+    }
+    with pytest.raises(PaletteError, match="'A_b' and 'a/b' would name one material"):
+        read_annotations(write(tmp_path / "coco.json", content), SHAPE)
+
+
 def test_no_region_is_said(tmp_path):
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros(SHAPE, np.uint8))
     for path in (tmp_path / "black.png", write(tmp_path / "none.json", {"annotations": []})):

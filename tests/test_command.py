@@ -295,3 +295,14 @@ def test_maps_of_the_same_bits_are_one_file(inputs):
     images = [images_of(bpy.data.materials[name]) for name in "ab"]
     # the normals and the heights
     assert len(set(images[0]) & set(images[1])) == 2
+
+
+def test_regions_named_as_files_of_the_palette_are_written(inputs):
+    (inputs / "masks" / "a.png").rename(inputs / "masks" / "masks.png")
+    (inputs / "masks" / "b.png").rename(inputs / "masks" / "palette.json.png")
+    assert extract(inputs) == 0
+    content = json.loads((inputs / "out" / "palette.json").read_text(encoding="utf-8"))
+    assert [m["name"] for m in content["materials"]] == ["masks", "palette.json"]
+    files = [m["maps"]["basecolor"]["file"] for m in content["materials"]]
+    assert files == ["masks_/masks__basecolor.png", "palette.json_/palette.json__basecolor.png"]
+    assert all((inputs / "out" / file).is_file() for file in files)

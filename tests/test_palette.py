@@ -229,6 +229,13 @@ def test_no_region_is_said():
         extract_palette(photo_and_regions()[0], [], SETTINGS, quiet)
 
 
+def test_two_regions_of_one_file_name_are_refused():
+    pixels, (gravel, paint, _) = photo_and_regions()
+    regions = [Region("a/b", gravel.mask), Region("A_b", paint.mask)]
+    with pytest.raises(PaletteError, match="'a/b' and 'A_b' would name one material"):
+        extract_palette(pixels, regions, SETTINGS, quiet)
+
+
 def test_the_sheet_shows_every_material(written):
     picture = cv2.imread(str(written[0] / "palette.png"))
     # the constant paint fills the base colour column of the second row with its own colour

@@ -131,6 +131,9 @@ def test_a_strip_along_the_photos_edge_is_bounded_by_it():
         ("Com1", "_Com1"),
         ("console", "console"),
         ("...", "region"),
+        ("masks", "masks_"),
+        ("Palette.PNG", "Palette.PNG_"),
+        ("blender_assets.cats.txt ", "blender_assets.cats.txt_"),
         ("", "region"),
     ],
 )  # fmt: skip
