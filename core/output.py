@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from .errors import PaletteError
-from .region import PALETTE_FILES, file_name
+from .region import GEOMETRY, PALETTE_FILES, file_name
 
 MAPS = ("basecolor", "normal", "roughness", "height", "metallic")
 DESKTOP_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # a file browser leaves them; the folder counts as empty
@@ -84,7 +84,7 @@ def _owned_files(target: Path, folder: str | Path, overwrite: bool) -> list[str]
             f"Output folder '{folder}' holds files but no palette of this extension (palette.json), so nothing "
             f"in it is overwritten. Name another folder."
         ) from None
-    owned = list(PALETTE_FILES)
+    owned = [*PALETTE_FILES, f"masks/{GEOMETRY}"]
     for name, maps in records:
         name = file_name(name)
         owned += [f"masks/{name}.png", f"exemplars/{name}.png", f"{name}/{name}.json"]

@@ -84,6 +84,13 @@ def test_overwriting_replaces_what_the_palette_owns_and_keeps_the_rest(tmp_path,
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+def test_old_corners_do_not_stay_beside_new_masks(palette):
+    (palette / "masks" / "regions.json").write_text("old")
+    with staged(palette, overwrite=True) as staging:
+        write_palette(staging, ["moss"])
+    assert "masks/regions.json" not in content(palette)
+
+
 def test_a_mask_painted_beside_the_old_ones_becomes_the_new_palettes(palette):
     """Masks edited in DIR/masks are passed back with --masks DIR/masks -o DIR --overwrite."""
     with staged(palette, overwrite=True) as staging:
