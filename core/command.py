@@ -272,7 +272,7 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
     from .exemplar import card_colour
     from .image import read_photo
     from .output import staged
-    from .palette import Material, Settings, extract_palette, write_material, write_palette
+    from .palette import Material, Settings, extract_palette, write_concept, write_material, write_palette
     from .region import add_geometry, file_name, parse_card, parse_corners, parse_measure, read_regions
 
     settings = Settings(
@@ -350,10 +350,11 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         failed = [material for material in palette.materials if material.error]
         for material in palette.materials:
             if arguments.fit_scene and not material.error:
-                _fit_one(material, seen.get(material.name), line, None, settings)
+                concept = write_concept(material, staging / file_name(material.name)) if material.concept else None
+                _fit_one(material, seen.get(material.name), line, concept, settings)
         if len(failed) == len(regions):
             raise PaletteError("no material could be made: " + "; ".join(material.error for material in failed))
-        content = write_palette(palette, staging, line.progress, written)
+        content = write_palette(palette, staging, line.progress, written, referred=False)
         previews = {material.name: material.preview for material in palette.materials if not material.error}
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
     line.say(f"{len(regions) - len(failed)} of {len(regions)} materials written to {folder}")

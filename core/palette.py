@@ -609,11 +609,19 @@ def write_material(material: Material, folder: Path) -> dict:
         scale = max(2 * float(np.abs(svbrdf.height).max()), 1e-9)
         entry("height", 0.0, svbrdf.height / scale + 0.5, 16, scale=scale, midlevel=0.5)
     if material.concept is not None:
-        tensors, facts = material.concept
-        write_tensors(folder / f"{name}_concept.safetensors", tensors)
-        _write_json(folder / f"{name}_concept.json", {"version": CONCEPT_VERSION, "name": material.name} | facts)
+        write_concept(material, folder)
     _write_json(folder / f"{name}.json", record)
     return record
+
+
+def write_concept(material: Material, folder: Path) -> Path:
+    """Write a material's concept, which it has, into `folder` (made if missing); return the path of its .json."""
+    tensors, facts = material.concept
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{file_name(material.name)}_concept.json"
+    write_tensors(path.with_suffix(".safetensors"), tensors)
+    _write_json(path, {"version": CONCEPT_VERSION, "name": material.name} | facts)
+    return path
 
 
 def write_palette(
@@ -621,10 +629,12 @@ def write_palette(
     folder: Path,
     progress: Progress = lambda fraction, message: None,
     written: dict[str, dict] | None = None,
+    referred: bool = True,
 ) -> dict:
     """Write maps, masks/, palette.json and palette.png into an empty folder; return what palette.json holds.
 
-    written: records, by name, of materials that `write_material` has put into the folder already.
+    written: records, by name, of materials that `write_material` has put into the folder already; referred: who has
+    done so refers to their files by now, so that none of them is dropped.
     """
     start = time.perf_counter()
     records = []
@@ -632,7 +642,7 @@ def write_palette(
         progress(0.8 * i / len(palette.materials), f"writing {material.name}")
         record = (written or {}).get(material.name)
         records.append(record or write_material(material, folder / file_name(material.name)))
-    if not written:  # who has written them may refer to them already
+    if not (written and referred):
         _store_once(records, folder)
     if palette.regions:
         (folder / "masks").mkdir()

@@ -306,3 +306,37 @@ def test_regions_named_as_files_of_the_palette_are_written(inputs):
     files = [m["maps"]["basecolor"]["file"] for m in content["materials"]]
     assert files == ["masks_/masks__basecolor.png", "palette.json_/palette.json__basecolor.png"]
     assert all((inputs / "out" / file).is_file() for file in files)
+
+
+def test_what_regions_of_the_same_pixels_give_is_stored_once(inputs):
+    import bpy
+    from material_palette.core.nodes import images_of
+
+    (inputs / "masks" / "b.png").write_bytes((inputs / "masks" / "a.png").read_bytes())
+    assert extract(inputs, "--full-maps") == 0
+    a, b = (m["maps"] for m in json.loads((inputs / "out/palette.json").read_text())["materials"])
+    assert a == b == json.loads((inputs / "out/b/b.json").read_text())["maps"]
+    assert all((inputs / "out" / m["file"]).is_file() for m in b.values() if "file" in m)
+    assert [p.name for p in (inputs / "out/b").iterdir()] == ["b.json"]
+    bpy.ops.wm.open_mainfile(filepath=str(inputs / "out/palette.blend"))
+    assert set(images_of(bpy.data.materials["b"])) == set(images_of(bpy.data.materials["a"])) != set()
+
+
+def test_fitting_at_once_samples_again_from_kept_concepts(inputs, capsys, monkeypatch):
+    from material_palette.core import command, reduction
+    from material_palette.core.scene import Seen
+
+    whole = reduction.reduce
+
+    def coarse(svbrdf, progress, visible=0.0, parts=1, pixels=None):
+        if pixels is None:  # as if no more could be told before a camera came near
+            return reduction.Reduction(reduction.shrink(svbrdf, 24))
+        return whole(svbrdf, progress, visible, parts, pixels)
+
+    monkeypatch.setattr(reduction, "reduce", coarse)
+    monkeypatch.setattr(command, "_look", lambda path, names: {"a": Seen(200.0), "b": Seen(20.0)})
+    assert extract(inputs, "--keep-concepts", "--fit-scene", "scene.blend") == 0
+    said = capsys.readouterr().out
+    assert "a: sampled again from its concept" in said and "b: sampled again" not in said
+    assert cv2.imread(str(inputs / "out/a/a_basecolor.png")).shape[0] > 24
+    assert (inputs / "out/a/a_concept.json").is_file() and (inputs / "out/b/b_concept.safetensors").is_file()
