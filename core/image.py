@@ -299,8 +299,10 @@ def _one_line(error: str) -> str:
 
 def _channels(path: Path, spec: "oiio.ImageSpec") -> tuple[list[int], int | None]:
     """Indices of red, green, blue (one index thrice for grey), and of alpha or None."""
-    if "LAB" in _stored_model(spec):
-        raise PaletteError(f"Photo '{path}' is stored as {_stored_model(spec)}. Save it as RGB.")
+    model = _stored_model(spec)
+    if "LAB" in model or "LOGL" in model:  # OpenCV's default for floats is LogLuv
+        how = " (OpenCV: IMWRITE_TIFF_COMPRESSION 1)" if "LOGL" in model else ""
+        raise PaletteError(f"Photo '{path}' is stored as {model}. Save it as RGB{how}.")
     names = [name.lower() for name in spec.channelnames]
     for prefix in [""] + [name[:-1] for name in names if name.endswith(".r")]:
         if all(prefix + c in names for c in "rgb"):
@@ -348,8 +350,8 @@ def _focal(spec: "oiio.ImageSpec") -> float | None:
     if exif("FocalLengthIn35mmFilm"):
         diagonal = float(np.hypot(spec.width, spec.height)) / max(spec.width, spec.height)
         return exif("FocalLengthIn35mmFilm") / FILM_DIAGONAL * diagonal
-    unit = {2: 25.4, 3: 10.0}.get(int(exif("FocalPlaneResolutionUnit")), 25.4)
-    across = exif("PixelXDimension") or spec.width
+    unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}.get(int(exif("FocalPlaneResolutionUnit")), 25.4)  # mm
+    across = max(exif("PixelXDimension") or spec.width, exif("PixelYDimension") or spec.height)
     return (exif("FocalLength") * exif("FocalPlaneXResolution") / unit / across) or None
 
 

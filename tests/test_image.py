@@ -17,6 +17,7 @@ from material_palette.core.errors import PaletteError
 from material_palette.core.image import (
     linear_from_srgb,
     read_codes,
+    read_focal,
     read_mask,
     read_photo,
     srgb_from_linear,
@@ -90,6 +91,25 @@ def test_exif_orientation_is_applied(tmp_path, orientation):
     path = store(tmp_path / "a.jpg", pixels, Orientation=orientation, Compression="jpeg:98")
     upright = cv2.imread(str(path))[..., ::-1]  # OpenCV applies it too
     np.testing.assert_allclose(srgb_from_linear(read_photo(path).pixels) * 255, upright, atol=3)
+
+
+@pytest.mark.parametrize("width, height", [(80, 60), (60, 80)])
+@pytest.mark.parametrize("unit, length", [(2, 25.4), (3, 10.0), (4, 1.0), (5, 1e-3)])
+def test_a_focal_length_by_the_sensors_resolution_counts_longer_sides(tmp_path, width, height, unit, length):
+    exif = {"FocalLength": 50.0, "FocalPlaneXResolution": 2 * length, "FocalPlaneResolutionUnit": unit}
+    exif |= {"PixelXDimension": width, "PixelYDimension": height}
+    attributes = {f"Exif__{name}": value for name, value in exif.items()}
+    path = store(tmp_path / "a.jpg", noise(3, height, width), **attributes)
+    assert read_focal(path) == pytest.approx(100 / 80, rel=1e-3)  # 2 px a mm
+
+
+def test_a_logluv_tiff_is_refused_with_the_way_out(tmp_path):
+    pixels = np.full((40, 56, 3), 0.5, np.float32)
+    cv2.imwrite(str(tmp_path / "a.tif"), pixels)
+    with pytest.raises(PaletteError, match="a.tif' is stored as LOGLUV. Save it as RGB .*COMPRESSION 1"):
+        read_photo(tmp_path / "a.tif")
+    cv2.imwrite(str(tmp_path / "b.tif"), pixels, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    assert np.array_equal(read_photo(tmp_path / "b.tif").pixels, pixels)
 
 
 def test_grey_and_grey_with_alpha_become_rgb(tmp_path):
