@@ -88,7 +88,7 @@ def cut_exemplar(
         warnings.append(f"the region spreads over {w} x {h} px; the fullest {LARGEST} x {LARGEST} px of it are used")
     pixels, mask = np.ascontiguousarray(pixels[box]), np.ascontiguousarray(mask[box])
     seen = mask & (pixels > BLACK).any(-1)
-    whole = pixels
+    whole, inside = pixels, mask
     pixels, mask = _without_colourless(pixels, mask, warnings)
     if (seen & mask).any():
         # what the camera saw as white is as bright as that at least; of black nothing is known
@@ -120,6 +120,11 @@ def cut_exemplar(
         if white_balance == "region":
             mean = (pixels / shading)[mask].mean(0)
             shading = shading * (mean / max(float(mean @ LUMINANCE), 1e-6)).clip(1e-3)
+        beyond = float(((pixels / shading)[mask] > 1).any(-1).mean()) if white(whole, inside) > 1 else 0.0
+        if beyond > LEAST_SAID:
+            warnings.append(
+                f"{beyond:.0%} of the region is brighter than 1 and cut there; darken the photo so that white is 1"
+            )
     pixels = pixels / shading
     progress(1.0, "evening the light")
     uniform = _uniform_colour(pixels, mask)

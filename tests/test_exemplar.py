@@ -131,6 +131,15 @@ def test_one_clipped_channel_is_over_exposed_and_a_bright_photo_in_floats_is_not
     assert cut_exemplar(bright, full(bright)).mask.mean() > 0.98
 
 
+def test_what_is_cut_of_a_photo_in_floats_is_said():
+    pixels = np.clip(linear_from_srgb(pebbles(200, 200)), 0.05, 0.97)
+    words = "of the region is brighter than 1 and cut there"
+    assert not any(words in warning for warning in cut_exemplar(pixels, full(pixels)).warnings)
+    warnings = cut_exemplar(10 * pixels, full(pixels), flatten=False).warnings
+    (said,) = (warning for warning in warnings if words in warning)
+    assert said.startswith(f"{(10 * pixels > 1).any(-1).mean():.0%} ")
+
+
 def test_specks_of_plain_white_and_of_glare_are_filled_and_a_bright_surface_kept():
     bright = linear_from_srgb(0.7 + 0.15 * pebbles(120, 120))
     photo = bright.copy()
