@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 
 from .errors import PaletteError
-from .image import read_codes
-from .region import Region, check_names
+from .image import check_shape, read_codes
+from .region import Region, check_names, readable
 
+FARTHEST = 10  # longer sides of the image: a polygon that goes beyond is of another one
 MOST_CODES = 64  # more colours than that are a picture, or borders that were smoothed
 
 
@@ -32,6 +33,7 @@ def read_annotations(path: str | Path, shape: tuple[int, int], photo_name: str =
 
 def _coded(path: Path, shape: tuple[int, int]) -> dict[str, np.ndarray]:
     codes = read_codes(path, shape)
+    digits = 2 * codes.itemsize
     flat = codes.reshape(-1, codes.shape[2]).astype(np.uint64)
     keys = flat[:, 0]
     for channel in flat.T[1:]:
@@ -47,7 +49,7 @@ def _coded(path: Path, shape: tuple[int, int]) -> dict[str, np.ndarray]:
     for index, at in enumerate(first):
         code = flat[at].tolist()
         if any(code):
-            name = f"label_{code[0]}" if len(set(code)) == 1 else "colour_" + "".join(f"{c:02x}" for c in code)
+            name = f"label_{code[0]}" if len(set(code)) == 1 else "colour_" + "".join(f"{c:0{digits}x}" for c in code)
             found[name] = owner == index
     return found
 
@@ -61,12 +63,16 @@ def _coco(path: Path, shape: tuple[int, int], photo_name: str) -> dict[str, np.n
         image = _image(path, images, photo_name)
         if image is not None:
             annotations = [a for a in annotations if a.get("image_id", image["id"]) == image["id"]]
-        names = {category["id"]: str(category["name"]) for category in content.get("categories", [])}
-        size = (int(image["height"]), int(image["width"])) if image and "height" in image else None
+        names = {category["id"]: readable(str(category["name"] or "")) for category in content.get("categories", [])}
+        size = (int(image["height"]), int(image["width"])) if image and "height" in image else shape
         found: dict[str, np.ndarray] = {}
         for number, annotation in enumerate(annotations, 1):
             name = names.get(annotation.get("category_id"), f"mask_{number:02}")
-            mask = _mask(annotation["segmentation"], size, shape)
+            if not name.strip():
+                raise PaletteError(f"'{path}' has a category without a name, id {annotation['category_id']}. Name it.")
+            segmentation = annotation["segmentation"]
+            check_shape(path, segmentation["size"] if isinstance(segmentation, dict) else size, shape)
+            mask = _mask(segmentation, size, shape)
             found[name] = found[name] | mask if name in found else mask
         return found
     except PaletteError:
@@ -87,7 +93,7 @@ def _image(path: Path, images: list[dict], photo_name: str) -> dict | None:
     raise PaletteError(f"'{path}' is about {len(images)} images and none is named '{stem}'. Name the photo as there.")
 
 
-def _mask(segmentation: list | dict, size: tuple[int, int] | None, shape: tuple[int, int]) -> np.ndarray:
+def _mask(segmentation: list | dict, size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
     """(H, W) bool of polygons [[x, y, x, y, ..], ..] or run lengths {"size": [h, w], "counts": ..}."""
     if isinstance(segmentation, dict):
         height, width = segmentation["size"]
@@ -98,12 +104,14 @@ def _mask(segmentation: list | dict, size: tuple[int, int] | None, shape: tuple[
         values = np.arange(len(runs)) % 2 == 1
         mask = np.repeat(values, runs).reshape(width, height).T  # columns one after the other
         return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-    height, width = size or shape
+    height, width = size
     mask = np.zeros(shape, np.uint8)
     for polygon in segmentation:
         points = np.asarray(polygon, np.float64).reshape(-1, 2) * (shape[1] / width, shape[0] / height)
         if len(points) < 3 or not np.isfinite(points).all():
             raise ValueError("a polygon has fewer than three points or one that is no number")
+        if np.abs(points).max() > FARTHEST * max(shape):
+            raise ValueError("a polygon leaves the image by far")
         # COCO's corners of pixels are at whole numbers, OpenCV's centres; 4 bits of fraction
         cv2.fillPoly(mask, [np.round((points - 0.5) * 16).astype(np.int32)], 1, shift=4)
     return mask > 0

@@ -150,7 +150,7 @@ def read_mask(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
         spec = image.spec()
         orientation = spec.get_int_attribute("Orientation", 1)
         height, width = shape if orientation < 5 else shape[::-1]
-        _check_aspect(path, spec, shape, orientation)
+        check_shape(path, (spec.height, spec.width)[:: 1 if orientation < 5 else -1], shape)
         alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
         colour = [c for c in range(spec.nchannels) if c not in (alpha, spec.z_channel)] or [alpha]
         least = LOSSY_ZERO.get(image.format_name(), 0)
@@ -182,7 +182,7 @@ def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
         height, width = shape if orientation < 5 else shape[::-1]
         if image.format_name() in LOSSY_ZERO or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             raise PaletteError(f"Mask '{path}' doesn't keep colours exactly. Save it as PNG of 8 or 16 bits.")
-        _check_aspect(path, spec, shape, orientation)
+        check_shape(path, (spec.height, spec.width)[:: 1 if orientation < 5 else -1], shape)
         rows, columns = _nearest(spec.height, height), _nearest(spec.width, width)
         alpha = spec.alpha_channel
         colour = [c for c in range(spec.nchannels) if c != alpha]
@@ -193,13 +193,12 @@ def read_codes(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
     return _upright(codes[..., colour], orientation)
 
 
-def _check_aspect(path: Path, spec: "oiio.ImageSpec", shape: tuple[int, int], orientation: int) -> None:
-    """Raise PaletteError for a mask that, turned upright, is not of a photo's shape (H, W)."""
-    height, width = shape if orientation < 5 else shape[::-1]
-    if abs(spec.width * height / (spec.height * width) - 1) > ASPECT_TOLERANCE:
-        own = (spec.width, spec.height) if orientation < 5 else (spec.height, spec.width)
+def check_shape(path: Path, own: tuple[int, int], shape: tuple[int, int]) -> None:
+    """Raise PaletteError for a mask (H, W), upright, whose aspect ratio is more than 2 % off a photo's shape (H, W)."""
+    height, width = own
+    if min(own) < 1 or abs(width * shape[0] / (height * shape[1]) - 1) > ASPECT_TOLERANCE:
         raise PaletteError(
-            f"Mask '{path}' is {own[0]} x {own[1]} px, of another shape than the photo "
+            f"Mask '{path}' is {width} x {height} px, of another shape than the photo "
             f"({shape[1]} x {shape[0]} px). Paint it on the photo itself."
         )
 

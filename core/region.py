@@ -71,7 +71,7 @@ def read_regions(folder: str | Path, shape: tuple[int, int], scale: float = 1.0)
             raise PaletteError(
                 f"Masks '{owner.name}' and '{file.name}' in '{folder}' would name one material. Rename or remove one."
             )
-    regions = [Region(_readable(file.stem), read_mask(file, shape)) for file in files]
+    regions = [Region(readable(file.stem), read_mask(file, shape)) for file in files]
     if (folder / GEOMETRY).is_file():
         _read_geometry(folder / GEOMETRY, regions, scale)
     return regions
@@ -80,7 +80,7 @@ def read_regions(folder: str | Path, shape: tuple[int, int], scale: float = 1.0)
 def parse_corners(text: str) -> tuple[str, np.ndarray]:
     """(region, corners) of "region:x,y x,y x,y x,y". Raises PaletteError."""
     name, _, points = text.rpartition(":")
-    return _readable(name), _points(points.split(), 4, text, "NAME:X,Y X,Y X,Y X,Y")
+    return readable(name), _points(points.split(), 4, text, "NAME:X,Y X,Y X,Y X,Y")
 
 
 def parse_measure(text: str) -> tuple[str, tuple[np.ndarray, float]]:
@@ -88,7 +88,7 @@ def parse_measure(text: str) -> tuple[str, tuple[np.ndarray, float]]:
     name, _, rest = text.rpartition(":")
     points, _, metres = rest.partition("=")
     usage = "NAME:X,Y X,Y=METRES"
-    return _readable(name), (_points(points.split(), 2, text, usage), _metres(metres, text, usage))
+    return readable(name), (_points(points.split(), 2, text, usage), _metres(metres, text, usage))
 
 
 def parse_card(text: str) -> tuple[Path | None, np.ndarray]:
@@ -208,7 +208,7 @@ def too_small(count: int, share: float) -> str:
     )
 
 
-def _readable(stem: str) -> str:
+def readable(stem: str) -> str:
     """A file's stem as text that JSON can hold: Linux allows names that are not UTF-8, macOS takes accents apart."""
     return unicodedata.normalize("NFC", stem.encode("utf-8", "replace").decode("utf-8"))
 

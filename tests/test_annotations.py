@@ -68,6 +68,16 @@ def test_colours_and_indices_are_regions_and_black_is_none(tmp_path, masks):
     assert (found["label_1"] == masks["floor"]).all() and (found["label_300"] == masks["wall"]).all()
 
 
+def test_colours_of_16_bits_have_names_of_their_own(tmp_path, masks):
+    colours = np.zeros((*SHAPE, 3), np.uint16)
+    colours[masks["floor"]] = (0, 0x345, 0x12)
+    colours[masks["wall"]] = (0, 0x45, 0x123)
+    cv2.imwrite(str(tmp_path / "colours.png"), colours)
+    found = by_name(read_annotations(tmp_path / "colours.png", SHAPE))
+    assert (found["colour_001203450000"] == masks["floor"]).all()
+    assert (found["colour_012300450000"] == masks["wall"]).all()
+
+
 def test_codes_are_resized_without_new_ones(tmp_path, masks):
     indices = np.zeros(SHAPE, np.uint8)
     indices[masks["floor"]] = 200
@@ -145,6 +155,26 @@ def test_polygons_of_one_category_are_one_region(tmp_path):
 )
 def test_damaged_json_is_named(tmp_path, content):
     with pytest.raises(PaletteError, match="coco.json"):
+        read_annotations(write(tmp_path / "coco.json", content), SHAPE)
+
+
+@pytest.mark.parametrize(
+    "size, name, segmentation, words",
+    [
+        (SHAPE, "wall", {"size": (60, 40), "counts": [0, 2400]}, "coco.json' is 40 x 60 px, of another shape than the"),
+        ((60, 40), "wall", [[0, 0, 9, 0, 9, 9]], "coco.json' is 40 x 60 px, of another shape than the photo"),
+        ((0, 0), "wall", [[0, 0, 9, 0, 9, 9]], "coco.json' is 0 x 0 px"),
+        (SHAPE, "wall", [[0, 0, 1e12, 0, 9, 9]], "coco.json' .*a polygon leaves the image by far"),
+        (SHAPE, "", [[0, 0, 9, 0, 9, 9]], "coco.json' has a category without a name, id 0"),
+    ],
+)
+def test_what_belongs_to_no_region_of_the_photo_is_named(tmp_path, size, name, segmentation, words):
+    content = {
+        "images": [{"id": 1, "height": size[0], "width": size[1]}],
+        "categories": [{"id": 0, "name": name}],
+        "annotations": [{"category_id": 0, "image_id": 1, "segmentation": segmentation}],
+    }
+    with pytest.raises(PaletteError, match=words):
         read_annotations(write(tmp_path / "coco.json", content), SHAPE)
 
 
