@@ -185,12 +185,14 @@ def extract_palette(
     A region that cannot be extracted becomes a material with status "failed"; the others are finished. on_material is
     called with each material as soon as it is done, in their order but on another thread, as progress may be. focal is
     the photo's focal length in px where it is known. progress may raise Cancelled, which ends the call.
-    Raises PaletteError for settings that cannot be honoured, when there is no region and for two of one file name.
+    Raises PaletteError for settings that cannot be honoured, weights that cannot be read, when there is no region and
+    for two of one file name.
     """
     settings.check()
     if not regions:
         raise PaletteError("there is no region; paint one or choose automatic segmentation")
     check_names(regions)
+    decomposition.prepare(settings.decomposer)
     start = time.perf_counter()
     engine = engines.open_engine(settings.engine, settings.diffusion)
     palette = Palette(pixels, photo_name, regions, settings, [])
@@ -355,6 +357,7 @@ def resample_material(path: Path, settings: Settings, progress: Progress) -> Mat
     Raises PaletteError for settings that cannot be honoured and for files that hold no concept.
     """
     settings.check()
+    decomposition.prepare(settings.decomposer)
     progress(0.0, "reading the concept")
     try:
         path = path.with_suffix(".json")

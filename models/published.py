@@ -1,6 +1,5 @@
 """Checkpoints that others publish: their tensors without running code, and in what they differ from a network's."""
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,23 @@ from ..core.tensors import read_tensors
 def read_state(path: Path) -> dict[str, torch.Tensor]:
     """The tensors, as float32 on the CPU, of a safetensors file, a state dict or a checkpoint of PyTorch Lightning.
 
-    Raises OSError where the file cannot be read, PaletteError where that could run code from it.
+    Raises OSError where the file cannot be read, PaletteError where it is no checkpoint or that could run code from it.
     """
     if path.suffix == ".safetensors":
         state = {name: torch.from_numpy(np.array(x)) for name, x in read_tensors(path)[0].items()}
     else:
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError):
+        except OSError:
+            raise
+        except Exception:  # a file of another kind is read as a pickle, which may fail in any way
             raise PaletteError(
                 f"'{path}' holds more than tensors, or is no checkpoint; it is not opened, as that could run code from "
                 "it. If you trust it, save its 'state_dict' alone with torch.save, and choose that file"
             ) from None
         state = state.get("state_dict", state) if isinstance(state, dict) else {}
-    return {name: x.float() for name, x in state.items() if isinstance(x, torch.Tensor)}
+        state = state if isinstance(state, dict) else {}
+    return {name: x.float() for name, x in state.items() if isinstance(name, str) and isinstance(x, torch.Tensor)}
 
 
 def differences(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> list[str]:

@@ -224,6 +224,14 @@ def test_resampling_does_not_replace_the_folder_of_its_concept(inputs, capsys):
     assert path.exists() and (inputs / "out/b/b_basecolor.png").exists()
 
 
+def test_a_wrong_file_of_weights_is_named_before_anything_is_sampled(inputs, capsys):
+    (inputs / "model.ckpt").write_text("hello")
+    assert extract(inputs, "--decomposer", f"resnet101={inputs / 'model.ckpt'}") == 2
+    said = capsys.readouterr()
+    assert "model.ckpt' holds more than tensors, or is no checkpoint" in said.err and "Traceback" not in said.err
+    assert "a:" not in said.out and "no material" not in said.err
+
+
 def test_concepts_of_diffusion_have_a_folder_of_their_own(inputs, capsys):
     assert extract(inputs, "--keep-concepts", "--engine", "diffusion", "--model", "nowhere") == 2
     assert "--concepts DIR" in capsys.readouterr().err

@@ -116,3 +116,20 @@ def test_a_file_that_could_run_code_is_not_opened(tmp_path):
         resnet101.load(path)
     with pytest.raises(PaletteError, match="missing.ckpt"):
         resnet101.load(tmp_path / "missing.ckpt")
+
+
+@pytest.mark.parametrize("content", [b"hello", b"", b"\x80", b"PK\x03\x04", b"(dp0\n.", b"{}", bytes(100)])
+def test_a_file_of_another_kind_is_named(tmp_path, content):
+    path = tmp_path / "model.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(PaletteError, match="model.ckpt"):
+        resnet101.load(path)
+    with pytest.raises(PaletteError, match="read the checkpoint"):
+        resnet101.load(tmp_path)
+
+
+@pytest.mark.parametrize("state", [{"state_dict": [1]}, {"state_dict": {3: torch.zeros(1)}}, [torch.zeros(1)]])
+def test_a_checkpoint_of_no_named_tensors_is_refused(tmp_path, state):
+    torch.save(state, tmp_path / "model.ckpt")
+    with pytest.raises(PaletteError, match="missing"):
+        resnet101.load(tmp_path / "model.ckpt")

@@ -29,6 +29,16 @@ def choose(decomposer: str) -> Callable[[np.ndarray, Callable[[float, str], None
     return partial(FROM_FILE[name], weights=Path(file))
 
 
+def prepare(decomposer: str) -> None:
+    """Read the weights of a decomposer name=FILE before there is a texture; they are kept.
+
+    Raises PaletteError for weights that cannot be read.
+    """
+    name, _, file = decomposer.partition("=")
+    if file:
+        {"unet": unet, "resnet101": resnet101}[name].load(Path(file))
+
+
 def decompose(texture: np.ndarray, progress: Callable[[float, str], None], decomposer: str = "unet") -> SVBRDF:
     """The SVBRDF of a texture (H, W, 3) float32 linear, which wraps; rolling the texture rolls the maps.
 
