@@ -100,14 +100,19 @@ def parse_card(text: str) -> tuple[Path | None, np.ndarray]:
 def add_geometry(regions: list[Region], corners: dict, measures: dict, scale: float = 1.0) -> None:
     """Give regions their corners and measures, by name, in px of a photo `scale` times smaller than its file.
 
-    Raises PaletteError for a name that no region has.
+    Raises PaletteError for a name that no region has, and for corners that all lie off one side of the photo.
     """
     by_name = {region.name: region for region in regions}
     for name in [*corners, *measures]:
         if name not in by_name:
             raise PaletteError(f"there is no region '{name}'; choose one of: {', '.join(by_name)}")
     for name, found in corners.items():
-        by_name[name].corners = found * scale
+        points, (height, width) = found * scale, by_name[name].mask.shape
+        if (points.max(0) <= 0).any() or (points.min(0) >= (width, height)).any():
+            raise PaletteError(
+                f"the corners of '{name}' lie outside of the photo, {width / scale:.0f} x {height / scale:.0f} px"
+            )
+        by_name[name].corners = points
     for name, (points, metres) in measures.items():
         by_name[name].measure = points * scale, metres
 

@@ -4,7 +4,15 @@ import cv2
 import numpy as np
 import pytest
 from material_palette.core.errors import PaletteError
-from material_palette.core.region import LEAST_AREA, LEAST_RADIUS, Region, check_region, file_name, read_regions
+from material_palette.core.region import (
+    LEAST_AREA,
+    LEAST_RADIUS,
+    Region,
+    add_geometry,
+    check_region,
+    file_name,
+    read_regions,
+)
 
 SHAPE = (48, 64)
 
@@ -82,6 +90,16 @@ def test_two_masks_of_one_name_are_refused(tmp_path, one, two):
     with pytest.raises(PaletteError, match="would name one material") as error:
         read_regions(tmp_path, SHAPE)
     assert one in str(error.value) and two in str(error.value)
+
+
+def test_corners_off_the_photo_are_refused():
+    region = Region("floor", np.ones(SHAPE, bool))
+    reaching = np.float64([[-9, -9], [90, -9], [90, 60], [-9, 60]])
+    add_geometry([region], {"floor": 2 * reaching}, {}, 0.5)
+    assert np.array_equal(region.corners, reaching)
+    for away in (reaching + (0, 100), reaching - (100, 0)):
+        with pytest.raises(PaletteError, match="corners of 'floor' lie outside of the photo, 128 x 96 px"):
+            add_geometry([region], {"floor": 2 * away}, {}, 0.5)
 
 
 def block(height, width):
