@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         "--merge-alike",
         nargs="?",
         type=float,
-        const=-1.0,
+        const=True,  # merging.MOST
         metavar="D",
         help="one material of regions that are at most D apart in texture and colour (0.2)",
     )
@@ -170,7 +170,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         written = write_palette(palette, staging)
         previews = {material.name: material.preview for material in materials if material.svbrdf is not None}
         nodes.write_blend(staging / "palette.blend", written, staging, previews, pack=arguments.pack)
-    line.say(f"{len(previews)} materials written to {output}")
+    line.say(f"{_count(len(previews), 'material')} written to {output}")
     return DONE
 
 
@@ -242,7 +242,7 @@ def _resample(arguments: argparse.Namespace) -> int:
         content = write_palette(palette, staging)
         previews = {material.name: material.preview for material in palette.materials}
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
-    print(f"{len(palette.materials)} materials written to {arguments.output}", flush=True)
+    print(f"{_count(len(palette.materials), 'material')} written to {arguments.output}", flush=True)
     return DONE
 
 
@@ -290,6 +290,8 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
     card = parse_card(arguments.grey_card) if arguments.grey_card else None
     if card and settings.white_balance != "off":
         raise PaletteError("--grey-card and --white-balance both tell the light's colour; leave one out")
+    if arguments.merge_alike is not None and not arguments.merge_alike >= 0:
+        raise PaletteError(f"--merge-alike {arguments.merge_alike:g} is no distance; choose 0 or more, such as 0.2")
     corners = dict(parse_corners(text) for text in arguments.corners)
     measures = dict(parse_measure(text) for text in arguments.measure)
     line = _Line(photo_path.name)
@@ -335,7 +337,8 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
                     written[material.name] = write_material(material, staging / file_name(material.name))
                 line.say(f"{material.name}: {sum(material.seconds.values()):.1f} s")
                 if material.target is not None:
-                    said = ", ".join(f"{key} {value}" for key, value in material.target.items())
+                    unknown = "nothing: region or texture is too small to be judged"
+                    said = ", ".join(f"{k} {unknown if v is None else v}" for k, v in material.target.items())
                     line.say(f"{material.name}: error {said}")
                 line.ledger(material.name, material.reduced)
                 for warning in material.warnings:
@@ -357,22 +360,24 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         content = write_palette(palette, staging, line.progress, written, referred=False)
         previews = {material.name: material.preview for material in palette.materials if not material.error}
         nodes.write_blend(staging / "palette.blend", content, staging, previews, pack=arguments.pack)
-    line.say(f"{len(regions) - len(failed)} of {len(regions)} materials written to {folder}")
+    line.say(f"{len(regions) - len(failed)} of {_count(len(regions), 'material')} written to {folder}")
     return SOME_FAILED if failed else DONE
 
 
-def _merged(photo, regions: list, most: float, line) -> list:
+def _merged(photo, regions: list, most: float | bool, line) -> list:
     """The regions of which those that are one material are merged; what was done goes into the photo's warnings."""
     from . import merging
 
-    most = merging.MOST if most < 0 else most
+    most = merging.MOST if most is True else most
     groups, distances = merging.find_alike(photo.pixels, regions, most)
     for (i, j), apart in sorted(distances.items(), key=lambda item: item[1]):
         names = f"{regions[i].name} and {regions[j].name}"
         if any(i in group and j in group for group in groups):
             photo.warnings.append(f"{names} are one material: {apart:.2f} apart, at most {most:g}")
             line.say(photo.warnings[-1])
-    line.say(f"{len(groups)} materials of {len(regions)} regions")
+        else:
+            line.say(f"{names} are {apart:.2f} apart")
+    line.say(f"{_count(len(groups), 'material')} of {_count(len(regions), 'region')}")
     return merging.merge(regions, groups)
 
 
@@ -411,6 +416,10 @@ class _Line:
         for e in reduced:
             cost = f"saves {e['bytes'] / 1e6:.2f} MB, " if e["bytes"] else ""
             self.say(f"{name}: reduced: {e['map']} {e['change']} ({cost}FLIP {e['flip']:.3f})")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _complain(error: Exception) -> None:

@@ -348,3 +348,22 @@ def test_fitting_at_once_samples_again_from_kept_concepts(inputs, capsys, monkey
     assert "a: sampled again from its concept" in said and "b: sampled again" not in said
     assert cv2.imread(str(inputs / "out/a/a_basecolor.png")).shape[0] > 24
     assert (inputs / "out/a/a_concept.json").is_file() and (inputs / "out/b/b_concept.safetensors").is_file()
+
+
+def test_the_distances_of_all_pairs_are_printed(inputs, capsys):
+    assert extract(inputs, "--merge-alike", "0") == 0
+    said = capsys.readouterr().out
+    assert "a and b are 0." in said and "2 materials of 2 regions" in said
+    assert extract(inputs, "--merge-alike", "100", "--overwrite") == 0
+    said = capsys.readouterr().out
+    assert "a and b are one material: 0." in said and "1 material of 2 regions" in said
+    assert "1 of 1 material written" in said
+    for wrong in ("nan", "-1"):
+        assert extract(inputs, f"--merge-alike={wrong}", "--overwrite") == 2
+        assert f"--merge-alike {wrong} is no distance" in capsys.readouterr().err
+
+
+def test_a_texture_too_small_to_be_judged_is_said(inputs, capsys):
+    (inputs / "masks" / "b.png").unlink()
+    assert extract(inputs, "--target-error", "0.5", "--resolution", "64", "--scale", "2") == 0
+    assert "found nothing: region or texture is too small" in capsys.readouterr().out
