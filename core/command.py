@@ -1,6 +1,8 @@
 """The command line: `blender -b --command material_palette extract PHOTO... -o DIR`, and the same outside Blender."""
 
 import argparse
+import contextlib
+import signal
 import sys
 import threading
 import time
@@ -10,14 +12,14 @@ from pathlib import Path
 from .dependencies import install_command, missing
 from .errors import PaletteError, explain
 
-DONE, BAD_INPUT, SOME_FAILED, INTERRUPTED = 0, 2, 3, 130
+DONE, BAD_INPUT, SOME_FAILED = 0, 2, 3
 
 
 def main(argv: list[str]) -> int:
     """Run one command; returns the exit code.
 
     0: all materials were made. 2: bad input, said on standard error, nothing written for that photo. 3: some regions
-    failed, the others were written. 130: interrupted, nothing written for that photo.
+    failed, the others were written. 130: interrupted, nothing written for that photo; 143 and 129: by SIGTERM, SIGHUP.
     """
     parser = _parser()
     try:
@@ -32,23 +34,50 @@ def main(argv: list[str]) -> int:
         return BAD_INPUT
     codes = [0]
     try:
-        if arguments.command == "resample":
-            return _resample(arguments)
-        if arguments.command == "fit":
-            return _fit(arguments)
-        for photo, masks, folder in _jobs(arguments):
-            try:
-                codes.append(_extract(photo, masks, folder, arguments))
-            except Exception as error:  # the other photos go on
-                _complain(error)
-                codes.append(BAD_INPUT)
+        with _signals_interrupt():
+            if arguments.command == "resample":
+                return _resample(arguments)
+            if arguments.command == "fit":
+                return _fit(arguments)
+            for photo, masks, folder in _jobs(arguments):
+                try:
+                    codes.append(_extract(photo, masks, folder, arguments))
+                except Exception as error:  # the other photos go on
+                    _complain(error)
+                    codes.append(BAD_INPUT)
     except PaletteError as error:
         _complain(error)
         return BAD_INPUT
-    except KeyboardInterrupt:
-        print("interrupted; nothing was written for this photo", file=sys.stderr)
-        return INTERRUPTED
+    except KeyboardInterrupt as end:
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            print("interrupted; nothing was written for this photo", file=sys.stderr, flush=True)
+        return 128 + (end.args[0] if end.args else signal.SIGINT)
     return BAD_INPUT if BAD_INPUT in codes else max(codes)
+
+
+@contextlib.contextmanager
+def _signals_interrupt():
+    """What asks a program to end, SIGTERM and SIGHUP, raises KeyboardInterrupt of its number, as Ctrl-C does of none,
+    so that nothing half-made is left. Not on another thread, and not where somebody else sees to it."""
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [
+        number for number in map(signal.Signals.__getitem__, names) if signal.getsignal(number) == signal.SIG_DFL
+    ]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+
+    def interrupt(number, frame):
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)  # cleaning up is not to be interrupted
+        raise KeyboardInterrupt(number)
+
+    try:
+        for number in numbers:
+            signal.signal(number, interrupt)
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _parser() -> argparse.ArgumentParser:

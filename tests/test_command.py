@@ -1,6 +1,10 @@
 """The command line on bad and on partly bad input; needs bpy, for palette.blend."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -367,3 +371,27 @@ def test_a_texture_too_small_to_be_judged_is_said(inputs, capsys):
     (inputs / "masks" / "b.png").unlink()
     assert extract(inputs, "--target-error", "0.5", "--resolution", "64", "--scale", "2") == 0
     assert "found nothing: region or texture is too small" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("name, code", [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_a_signal_ends_a_run_without_a_trace(inputs, name, code):
+    run = f"""
+import os, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import conftest
+from material_palette.core import command, palette
+
+def extract_palette(*_):
+    print(len(os.listdir()), flush=True)
+    os.kill(os.getpid(), signal.{name})
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+palette.extract_palette = extract_palette
+sys.exit(command.main(["extract", "photo.png", "--masks", "masks", "-o", "out"]))
+"""
+    before = sorted(p.name for p in inputs.iterdir())
+    done = subprocess.run([sys.executable, "-c", run], cwd=inputs, capture_output=True, text=True, timeout=120)
+    assert int(done.stdout) == len(before) + 1  # the staging folder
+    assert done.returncode == code and done.stderr == "interrupted; nothing was written for this photo\n"
+    assert sorted(p.name for p in inputs.iterdir()) == before
