@@ -338,15 +338,16 @@ class _Judge:
         return worst
 
     def _changed_most(self, kind: str, full: np.ndarray, other: np.ndarray) -> tuple[int, int]:
-        """Row and column in pixels of the window, of those side by side, in which two maps differ most."""
+        """Row and column in pixels of the window, of as few as cover the tile, in which two maps differ most."""
         half = max(self._side // 2, 1)  # tells where
         a, b = (_texels(x, (0, 0), half, half, looks=1) for x in (full, other))
         if kind == "basecolor":
             a, b = np.sqrt(a), np.sqrt(b)
         change = np.square(a - b).reshape(len(a), len(a), -1).sum(-1)
-        windows = _means(change, self._across // self._window)
+        count = math.ceil(self._across / self._window)
+        windows = _means(change, count)
         row, column = np.unravel_index(windows.argmax(), windows.shape)
-        return int(row) * self._window, int(column) * self._window
+        return int(row) * self._across // count, int(column) * self._across // count
 
     def _rendered(self, maps: Maps, corner: tuple[int, int]) -> list[np.ndarray]:
         """Pictures (window, window, 3), encoded, of a window under each of LIGHTS, a white plane being 1."""

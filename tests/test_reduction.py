@@ -67,6 +67,16 @@ def test_one_glossy_spot_is_kept():
     assert np.ndim(reduce(SVBRDF(GREY, FLAT, roughness)).svbrdf.roughness) == 2
 
 
+@pytest.mark.parametrize("side", (250, 1000))
+def test_every_part_of_a_tile_is_looked_at(side):
+    y, x = np.mgrid[:side, :side]
+    beyond = (y >= side // 128 * 128 + 8) | (x >= side // 128 * 128 + 8)
+    chequered = np.where((y // 8 + x // 8) % 2 == 0, 0.02, 0.58)
+    albedo = np.repeat(np.where(beyond, chequered, 0.3)[..., None], 3, 2).astype(np.float32)
+    found = reduce(SVBRDF(albedo, np.array([0, 0, 1], np.float32), 0.6), parts=1).svbrdf
+    assert np.ndim(found.albedo) == 3
+
+
 def test_a_tilt_of_the_whole_surface_is_no_flat_normal():
     tilted = np.broadcast_to(np.array([0.6, 0, 0.8], np.float32), (N, N, 3))
     assert reduce(SVBRDF(GREY, tilted, 0.5)).svbrdf.normal.shape[2:] == (3,)
