@@ -6,6 +6,7 @@
 The package is not imported (that needs torchvision); its weights are read without running anything they may hold.
 """
 
+import argparse
 import hashlib
 import sys
 from importlib.util import find_spec
@@ -26,6 +27,7 @@ CONVOLUTIONS = ("slice1.0", "slice2.5", "slice3.9", "slice4.11", "slice5.13")
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     spec = find_spec("stlpips_pytorch")
     if spec is None:
         sys.exit("stlpips-pytorch is missing: pip install --no-deps stlpips-pytorch==0.0.2")

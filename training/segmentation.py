@@ -1,6 +1,6 @@
 """How models/segmentation.safetensors was made: a linear discriminant of superpixels, fitted on collages.
 
-    .venv/bin/python training/segmentation.py --data DATA              # about 3 minutes on one core
+    .venv/bin/python training/segmentation.py --data DATA              # about 2 minutes on one core
     .venv/bin/python training/segmentation.py --data DATA --quick -o dist/segmentation.safetensors
 
 DATA is a folder with INDEX.csv, pbr/ and textures/. The collages (benchmarks/collage.py) are of textures under CC0,
