@@ -353,9 +353,13 @@ def main(given: list[str] | None = None) -> int:
         times(table, arguments.data)
     if "sheet" in arguments.only:
         sheet(arguments.data, arguments.output)
-    facts = {"command": records.command(), "commits": [records.commit()], "machine": records.machine()}
+    file = arguments.output / "segmentation.json"
+    # rows of runs before stay in the table, so their commits stay too
+    before = json.loads(file.read_text(encoding="utf-8"))["commits"] if file.exists() else []
+    commits = list(dict.fromkeys([*before, records.commit()]))
+    facts = {"command": records.command(), "commits": commits, "machine": records.machine()}
     text = json.dumps(facts | {"summary": table.summary()}, indent=1)
-    (arguments.output / "segmentation.json").write_text(text + "\n", encoding="utf-8")
+    file.write_text(text + "\n", encoding="utf-8")
     chart(table, arguments.output)
     print(text)
     return 0
