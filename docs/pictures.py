@@ -3,8 +3,8 @@
     .venv/bin/python docs/pictures.py
     .venv/bin/python docs/pictures.py WINDOW.png
 
-The first extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/facade.jpg, docs/render.jpg and
-docs/sides.jpg, in 4 minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip
+The first extracts both examples into dist/pictures/ and writes docs/demo.jpg, docs/render.jpg and docs/sides.jpg, in 4
+minutes. The second takes the pictures of the window that `tests/gui/run.sh EXTENSION.zip
 WINDOW.png` has left.
 """
 
@@ -28,7 +28,7 @@ from material_palette.core.image import srgb_from_linear  # noqa: E402
 from material_palette.core.region import Region  # noqa: E402
 from material_palette.core.sides import largest_side  # noqa: E402
 
-SHEETS = {"viaduct": "demo", "facade": "facade"}
+EXAMPLES = ("viaduct", "facade")
 SHOWN = [("viaduct", "masonry"), ("viaduct", "rubble"), ("facade", "stone_wall"), ("facade", "red_wood")]
 WINDOWS = {"4-picked": "window-regions", "9-assigned": "window"}  # of tests/gui/artist.sh
 REPEATS = 1.0  # of the tile along a wall
@@ -133,9 +133,8 @@ if __name__ == "__main__":
         for picture, name in WINDOWS.items():
             save(cv2.imread(f"{sys.argv[1].removesuffix('.png')}-{picture}.png"), DOCS / f"{name}.jpg", 1400)
         raise SystemExit
-    folders = {example: extract(example) for example in SHEETS}
-    for example, name in SHEETS.items():
-        save(cv2.imread(str(folders[example] / "palette.png")), DOCS / f"{name}.jpg", 1400)
+    folders = {example: extract(example) for example in EXAMPLES}
+    save(cv2.imread(str(folders["viaduct"] / "palette.png")), DOCS / "demo.jpg", 1400)
     build_scene(folders)
     rendered = ROOT / "dist" / "pictures" / "render.png"
     render(rendered)
