@@ -159,6 +159,9 @@ class MATERIAL_PALETTE_OT_merge_alike(NeedsPackages, NeedsRegion, Operator):
         try:
             pixels, _ = photo_reader(settings.photo)()
             masks = {region.key: read_mask_image(region) for region in enabled}
+            for region in enabled:
+                if masks[region.key].shape[::-1] != tuple(settings.photo.size):
+                    raise PaletteError(f"Region '{region.name}': its mask isn't of the photo's size; paint it anew")
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

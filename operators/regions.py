@@ -76,7 +76,7 @@ def follow_active_region(settings, context):
     """Where an Image Editor shows a region's mask, show the active region's instead."""
     if not (context.window_manager and settings.active_region < len(settings.regions)):
         return
-    masks = {region.mask for region in settings.regions}
+    masks = {region.mask for region in settings.regions if region.mask is not None}
     active = settings.regions[settings.active_region].mask
     for window in context.window_manager.windows:
         for area in window.screen.areas:

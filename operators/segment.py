@@ -24,6 +24,7 @@ class MATERIAL_PALETTE_OT_segment(BackgroundOperator, Operator):
     def prepare(self, context):
         settings = context.scene.material_palette
         read, (width, height) = photo_reader(settings.photo), settings.photo.size
+        self.photo = settings.photo.session_uid, width, height
         engine, count, seed = settings.segmentation, settings.auto_regions, settings.seed
         weights = None if engine == "auto" else pick_weights(context)
         if engine != "auto" and not weights:
@@ -44,6 +45,8 @@ class MATERIAL_PALETTE_OT_segment(BackgroundOperator, Operator):
         settings = scene.material_palette
         if settings.photo is None:
             raise PaletteError("The photo was removed meanwhile; no region was added")
+        if (settings.photo.session_uid, *settings.photo.size) != self.photo:
+            raise PaletteError("Another photo was chosen meanwhile; no region was added")
         for index in reversed(range(len(settings.regions))):
             if settings.regions[index].automatic:
                 remove_region(settings, index)

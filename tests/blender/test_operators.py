@@ -155,6 +155,13 @@ def test_regions_that_are_alike_are_merged_and_others_are_not(ready):
     assert len(ready.regions) == 1 and (read_mask_image(ready.regions[0]) == (both[0] | both[1])).all()
 
 
+def test_a_mask_of_another_size_is_named_before_regions_are_merged(ready):
+    ready.regions[1].mask.scale(8, 8)
+    with pytest.raises(RuntimeError, match="'right': its mask isn't of the photo's size"):
+        bpy.ops.material_palette.merge_alike(most=100.0)
+    assert len(ready.regions) == 2
+
+
 def test_region_names_stay_apart(ready):
     for _ in range(3):
         bpy.ops.material_palette.add_region()
@@ -799,6 +806,22 @@ def test_segment_leaves_out_what_is_the_artists_already(ready, monkeypatch, capf
     assert found.shape == mine.shape and (read_mask_image(own) == mine).all()
     assert not (found & mine).any() and found[~mine].mean() > 0.95
     assert "1 regions found, 1 are yours already. The sky is left out" in capfd.readouterr().out
+
+
+def test_segment_adds_nothing_to_a_photo_that_was_chosen_meanwhile(ready, monkeypatch):
+    from material_palette.core import segmentation
+    from material_palette.core.region import Region
+
+    other = bpy.data.images.new("other", 30, 20)
+
+    def segment(pixels, *_args):
+        ready.photo = other
+        return [Region("found", np.ones(pixels.shape[:2], bool))]
+
+    monkeypatch.setattr(segmentation, "segment", segment)
+    with pytest.raises(RuntimeError, match="Another photo was chosen meanwhile"):
+        bpy.ops.material_palette.segment()
+    assert [region.name for region in ready.regions] == ["left", "right"]
 
 
 def test_segment_by_weights_says_which_it_needs(ready):
