@@ -205,6 +205,7 @@ class MATERIAL_PALETTE_PG_settings(PropertyGroup):
         name="Photo", type=Image, poll=_photo_is_a_picture, description="The photo that materials are extracted from"
     )
     regions: CollectionProperty(type=MATERIAL_PALETTE_PG_region)
+    last_key: IntProperty(options={"HIDDEN"})  # of a region, ever: none gets that of one that was removed
     active_region: IntProperty(name="Active Region", min=0, update=_show_active_mask, options={"SKIP_SAVE"})
     show_regions: BoolProperty(
         name="Show Regions", default=True, description="Show the regions over the photo in the Image Editor"

@@ -130,11 +130,8 @@ def read_photo(
             f"{100 * negative / total:.3g} % of the pixels lie outside Rec.709; what is negative there became 0."
         )
     if (height, width) != (spec.height, spec.width):
-        large = (spec.width, spec.height) if orientation < 5 else (spec.height, spec.width)
-        warnings.append(
-            f"The photo was reduced from {large[0]} x {large[1]} px to {upright.shape[1]} x {upright.shape[0]} px: "
-            f"at most {max_pixels / 1e6:g} megapixels are used."
-        )
+        large = (spec.height, spec.width) if orientation < 5 else (spec.width, spec.height)
+        warnings.append(_reduced(large, upright.shape, max_pixels))
     return Photo(upright, warnings, focal and focal * max(height, width), width / spec.width)
 
 
@@ -425,6 +422,22 @@ def _unassociated(rgb: np.ndarray, coverage: np.ndarray) -> np.ndarray:
     if rgb.dtype != np.float32:
         rgb = np.minimum(rgb / np.float32(np.iinfo(rgb.dtype).max), np.maximum(coverage, 1e-6))
     return rgb / np.where(coverage > 0, coverage, 1)
+
+
+def reduce_photo(pixels: np.ndarray, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, list[str]]:
+    """A photo (H, W, 3) linear at most `max_pixels` large, as `read_photo` has it, and a warning if it was larger."""
+    height, width = _reduced_size(*pixels.shape[:2], max_pixels)
+    if (height, width) == pixels.shape[:2]:
+        return pixels, []
+    small = cv2.resize(np.ascontiguousarray(pixels), (width, height), interpolation=cv2.INTER_AREA)
+    return small, [_reduced(pixels.shape, small.shape, max_pixels)]
+
+
+def _reduced(before: tuple[int, ...], after: tuple[int, ...], max_pixels: int) -> str:
+    return (
+        f"The photo was reduced from {before[1]} x {before[0]} px to {after[1]} x {after[0]} px: "
+        f"at most {max_pixels / 1e6:g} megapixels are used."
+    )
 
 
 def _reduced_size(height: int, width: int, max_pixels: int) -> tuple[int, int]:

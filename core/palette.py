@@ -28,7 +28,7 @@ from .image import linear_from_srgb, srgb_from_linear, write_image
 from .mask import without_strays
 from .material import SVBRDF
 from .perceptual import Crops
-from .region import EXEMPLARS, GEOMETRY, Region, check_names, check_region, file_name, region_geometry
+from .region import EXEMPLARS, Region, check_names, check_region, file_name, write_geometry
 from .sides import largest_side, same_hue
 from .tensors import read_tensors, write_tensors
 from .torus import resize
@@ -651,7 +651,7 @@ def write_palette(
         (folder / "masks").mkdir()
     for region in palette.regions:
         write_image(folder / "masks" / f"{file_name(region.name)}.png", region.mask.astype(np.float32))
-    _write_geometry(palette, folder / "masks")
+    write_geometry(palette.regions, folder / "masks", palette.scale)
     progress(0.85, "writing the contact sheet")
     write_image(folder / "palette.png", sheet.contact_sheet(palette))
     seconds = palette.seconds | {"write": time.perf_counter() - start}
@@ -684,13 +684,6 @@ def _store_once(records: list[dict], folder: Path) -> None:
         if changed:
             name = file_name(record["name"])
             _write_json(folder / name / f"{name}.json", record)
-
-
-def _write_geometry(palette: Palette, folder: Path) -> None:
-    """The regions' corners and measures beside their masks, as `region.read_regions` reads them."""
-    content = {r.name: geometry for r in palette.regions if (geometry := region_geometry(r, palette.scale))}
-    if content:
-        _write_json(folder / GEOMETRY, content)
 
 
 def _write_json(path: Path, content: dict) -> None:

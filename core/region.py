@@ -128,6 +128,14 @@ def region_geometry(region: Region, scale: float = 1.0) -> dict:
     return found
 
 
+def write_geometry(regions: list[Region], folder: Path, scale: float = 1.0) -> None:
+    """Corners and measures, beside the regions' masks, as `read_regions` reads them; no file where there are none."""
+    content = {file_name(r.name): geometry for r in regions if (geometry := region_geometry(r, scale))}
+    if content:
+        text = json.dumps(content, indent=1, ensure_ascii=False)
+        (folder / GEOMETRY).write_text(text + "\n", encoding="utf-8")
+
+
 def _read_geometry(file: Path, regions: list[Region], scale: float) -> None:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))

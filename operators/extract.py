@@ -16,7 +16,7 @@ from ..core.errors import Abandoned, Cancelled, PaletteError, explain
 from . import history
 from .background import BackgroundOperator
 from .palette import active_entry, drop_before, put_in_palette, region_of
-from .photo import photo_focal, photo_reader
+from .photo import photo_focal, photo_reader, photo_scale
 from .preferences import decomposer, diffusion_settings
 from .rectify import corners_of, measure_of
 from .regions import read_mask_image
@@ -59,6 +59,7 @@ class _Order:
     temporary: str | None
     geometry: dict  # by region name: corners and measure, in px of a photo of `size`
     size: tuple
+    scale: float  # px of that photo per px of its file
     focal: float | None  # in longer sides of the photo
     diffusion: dict = field(default_factory=dict)  # settings of that engine
     warnings: list = field(default_factory=list)
@@ -302,6 +303,7 @@ def _read_order(settings, regions, seed, is_whole):
         diffusion=diffusion_settings(bpy.context),
         geometry={region.name: (corners_of(region), measure_of(region)) for region in regions},
         size=tuple(settings.photo.size),
+        scale=photo_scale(settings.photo),
         focal=settings.focal_length / 36.0 or photo_focal(settings.photo),
     )
     if not settings.pack:
@@ -449,7 +451,7 @@ def _extract(order, pixels, regions, settings, progress, send, staging):
         palette = Palette(pixels, order.photo_name, regions[: len(materials)], settings, materials)
     if order.folder:
         palette.warnings[:0] = order.warnings
-        palette.scale = pixels.shape[1] / order.size[0]
+        palette.scale = pixels.shape[1] / order.size[0] * order.scale
         write_palette(palette, staging, _to_the_end(progress), {one.record["name"]: one.record for one in made})
     return made, cancelled
 

@@ -13,6 +13,8 @@ from .setup import NeedsPackages, missing_sentence
 # Image.colorspace_settings names, with those of other configurations that mean the same.
 _SRGB = {"sRGB", "sRGB - Texture"}
 _LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Linear BT.709"}
+# custom properties of an upright copy: focal length, in longer sides, and px of it per px of its file
+_FOCAL, _SCALE = "material_palette_focal", "material_palette_scale"
 
 
 def photo_reader(image):
@@ -33,7 +35,7 @@ def photo_reader(image):
             raise PaletteError(f"Photo '{image.name}' lies on its side in its file; Open Photo turns it upright")
         return _file_reader(path)
     pixels = read_pixels(image)
-    return lambda: (pixels, [])
+    return lambda: _reduced(pixels)
 
 
 def take_photo(context, image):
@@ -51,7 +53,18 @@ def photo_focal(image):
     from ..core.image import read_focal
 
     path = bpy.path.abspath(image.filepath_raw, library=image.library)
-    return read_focal(path) if image.source == "FILE" and os.path.isfile(path) else None
+    return read_focal(path) if image.source == "FILE" and os.path.isfile(path) else image.get(_FOCAL)
+
+
+def photo_scale(image):
+    """Px of the photo per px of its file: 1 but where a large one was turned upright."""
+    return image.get(_SCALE, 1.0)
+
+
+def _reduced(pixels):
+    from ..core.image import reduce_photo
+
+    return reduce_photo(pixels)
 
 
 def _file_reader(path):
@@ -126,13 +139,17 @@ def _open(path):
 def _upright_copy(path):
     from ..core.image import read_photo, srgb_from_linear
 
-    pixels = read_photo(path).pixels
+    photo = read_photo(path)
+    pixels = photo.pixels
     height, width = pixels.shape[:2]
     image = bpy.data.images.new(os.path.basename(path), width, height, alpha=False)
     rgba = np.ones((height, width, 4), np.float32)
     rgba[..., :3] = np.clip(srgb_from_linear(pixels[::-1]), 0.0, 1.0)
     image.pixels.foreach_set(rgba.ravel())
     image.pack()
+    image[_SCALE] = photo.scale
+    if photo.focal:
+        image[_FOCAL] = photo.focal / max(height, width)
     return image
 
 
@@ -255,7 +272,7 @@ class MATERIAL_PALETTE_OT_restore_defaults(Operator):
         return {"FINISHED"}
 
 
-_KEPT = {"name", "active_region", "active_material", "palette_view", "show_regions", "author", "licence"}
+_KEPT = {"name", "last_key", "active_region", "active_material", "palette_view", "show_regions", "author", "licence"}
 
 CLASSES = (
     MATERIAL_PALETTE_OT_open_photo,

@@ -26,6 +26,12 @@ def set_corners(region, corners):
     region.has_corners = True
 
 
+def set_measure(region, points, metres):
+    region.measured = np.asarray(points, float).ravel().tolist()
+    region.measured_length = metres
+    region.has_measure = True
+
+
 class _OverRegion(OverPhoto):
     """Mixin: handles on the photo that belong to the region active at first, dragged one at a time."""
 

@@ -2,6 +2,7 @@
 
 import colorsys
 import os
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -24,9 +25,9 @@ def add_region(settings, name, mask, automatic=False):
     if mask is None:
         width, height = settings.photo.size
         mask = np.zeros((height, width), bool)
-    keys = [0, *(known.key for known in (*settings.regions, *settings.palette))]
+    key = max([settings.last_key, *(known.key for known in (*settings.regions, *settings.palette))]) + 1
     region = settings.regions.add()
-    region.key = max(keys) + 1
+    region.key = settings.last_key = key
     region.name = name
     region.mask = _mask_image(name, mask)
     region.colour = colorsys.hsv_to_rgb((len(settings.regions) - 1) * _GOLDEN_RATIO % 1.0, 0.75, 1.0)
@@ -332,7 +333,8 @@ class _ChoosesFolder:
 
 
 class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, NeedsPackages, NeedsPhoto, Operator):
-    """Add one region for each mask image of a folder, named after its file; any pixel that isn't black belongs"""
+    """Add one region for each mask image of a folder, named after its file; any pixel that isn't black belongs.
+    Corners and measures are read from regions.json beside them"""
 
     bl_idname = "material_palette.import_masks"
     bl_label = "Import Masks"
@@ -340,10 +342,13 @@ class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, NeedsPackages, NeedsPhoto
 
     def execute(self, context):
         from ..core.region import read_regions
+        from .photo import photo_scale
+        from .rectify import set_corners, set_measure
 
         settings = context.scene.material_palette
+        folder, scale = bpy.path.abspath(self.directory), photo_scale(settings.photo)
         try:
-            regions = read_regions(bpy.path.abspath(self.directory), tuple(settings.photo.size)[::-1])
+            regions = read_regions(folder, tuple(settings.photo.size)[::-1], scale)
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -354,13 +359,19 @@ class MATERIAL_PALETTE_OT_import_masks(_ChoosesFolder, NeedsPackages, NeedsPhoto
                 add_region(settings, region.name, region.mask)
             else:  # looked up each time: adding one moves the others
                 set_mask(settings.regions[region.name], region.mask)
+            known = settings.regions[region.name]
+            if region.corners is not None:
+                set_corners(known, region.corners)
+            if region.measure is not None:
+                set_measure(known, *region.measure)
         settings.active_region = active
         self.report({"INFO"}, f"{len(regions)} regions imported")
         return {"FINISHED"}
 
 
 class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, NeedsPackages, NeedsRegion, Operator):
-    """Write every region's mask as NAME.png into a folder, to be edited or passed to the command line"""
+    """Write every region's mask as NAME.png into a folder, to be edited or passed to the command line, and corners and
+    measures as regions.json"""
 
     bl_idname = "material_palette.export_masks"
     bl_label = "Export Masks"
@@ -368,10 +379,12 @@ class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, NeedsPackages, NeedsRegio
 
     def execute(self, context):
         from ..core.image import write_image
-        from ..core.region import file_name
+        from ..core.region import Region, file_name, write_geometry
+        from .photo import photo_scale
+        from .rectify import corners_of, measure_of
 
-        folder = bpy.path.abspath(self.directory)
-        regions = context.scene.material_palette.regions
+        folder, settings = bpy.path.abspath(self.directory), context.scene.material_palette
+        regions = settings.regions
         try:
             masks = {file_name(region.name): read_mask_image(region) for region in regions}
             if len(masks) < len(regions):
@@ -380,6 +393,8 @@ class MATERIAL_PALETTE_OT_export_masks(_ChoosesFolder, NeedsPackages, NeedsRegio
                 raise PaletteError(f"No such folder: {folder}")
             for name, mask in masks.items():
                 write_image(os.path.join(folder, f"{name}.png"), mask.astype(np.float32))
+            told = [Region(one.name, None, corners_of(one), measure_of(one)) for one in regions]
+            write_geometry(told, Path(folder), photo_scale(settings.photo) if settings.photo else 1.0)
         except (PaletteError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

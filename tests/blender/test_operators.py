@@ -60,13 +60,14 @@ def test_open_photo_refuses_by_name(settings, tmp_path, data_blocks):
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_turned_photo_is_opened_upright(settings, tmp_path, orientation):
     import OpenImageIO as oiio
-    from material_palette.core.image import read_photo
-    from material_palette.operators.photo import photo_reader, read_pixels
+    from material_palette.core.image import read_focal, read_photo
+    from material_palette.operators.photo import photo_focal, photo_reader, read_pixels
 
     pixels = np.zeros((40, 64, 3), np.uint8)
     pixels[:20, :32, 0] = 255
     spec = oiio.ImageSpec(64, 40, 3, "uint8")
     spec.attribute("Orientation", orientation)
+    spec.attribute("Exif:FocalLengthIn35mmFilm", 28)
     path = str(tmp_path / "turned.tif")
     output = oiio.ImageOutput.create(path)
     output.open(path, spec)
@@ -77,6 +78,18 @@ def test_a_turned_photo_is_opened_upright(settings, tmp_path, orientation):
     upright = read_photo(path).pixels
     np.testing.assert_allclose(read_pixels(settings.photo), upright, atol=0.01)
     np.testing.assert_allclose(photo_reader(settings.photo)()[0], upright, atol=0.01)
+    assert photo_focal(settings.photo) == pytest.approx(read_focal(path)) and read_focal(path) > 0.5
+
+
+def test_a_packed_photo_is_no_larger_than_one_of_a_file(monkeypatch):
+    from material_palette.core import image as core_image
+    from material_palette.operators.photo import photo_reader
+
+    monkeypatch.setattr(core_image.reduce_photo, "__defaults__", (50,))
+    image = bpy.data.images.new("packed", 20, 10)
+    image.pack()
+    pixels, (warning,) = photo_reader(image)()
+    assert pixels.shape == (5, 10, 3) and "from 20 x 10 px to 10 x 5 px" in warning
 
 
 def test_painted_photo_is_read_from_blender_as_linear(settings):
@@ -160,6 +173,29 @@ def test_a_mask_of_another_size_is_named_before_regions_are_merged(ready):
     with pytest.raises(RuntimeError, match="'right': its mask isn't of the photo's size"):
         bpy.ops.material_palette.merge_alike(most=100.0)
     assert len(ready.regions) == 2
+
+
+def test_masks_take_corners_and_measures_along(ready, tmp_path):
+    from material_palette.operators.rectify import corners_of, measure_of, set_corners, set_measure
+
+    corners = np.array([[10, 10], [60, 14], [60, 66], [10, 70]], float)
+    set_corners(ready.regions[0], corners)
+    set_measure(ready.regions[1], [[90, 10], [120, 10]], 0.5)
+    assert bpy.ops.material_palette.export_masks(directory=str(tmp_path)) == {"FINISHED"}
+    for region in ready.regions:
+        region.has_corners = region.has_measure = False
+    assert bpy.ops.material_palette.import_masks(directory=str(tmp_path)) == {"FINISHED"}
+    assert (corners_of(ready.regions[0]) == corners).all() and corners_of(ready.regions[1]) is None
+    points, metres = measure_of(ready.regions[1])
+    assert points.tolist() == [[90, 10], [120, 10]] and metres == 0.5 and measure_of(ready.regions[0]) is None
+
+
+def test_no_region_gets_the_key_of_one_that_was_removed(ready):
+    ready.active_region = 1
+    removed = ready.regions[1].key
+    bpy.ops.material_palette.remove_region()
+    bpy.ops.material_palette.add_region()
+    assert ready.regions[1].key > removed
 
 
 def test_region_names_stay_apart(ready):
