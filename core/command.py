@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     extract.add_argument(
         "--weights", type=Path, metavar="PATH", help="weights of sam (a folder) or materialistic (a file)"
     )
-    extract.add_argument("--regions", type=int, default=8, metavar="N", help="at most N found regions (%(default)s)")
+    extract.add_argument("--regions", type=int, metavar="N", help="at most N found regions (8)")
     extract.add_argument("--engine", default="patch", help="texture engine: patch or diffusion (%(default)s)")
     extract.add_argument("--keep-concepts", action="store_true", help="keep what was learnt, for `resample`")
     extract.add_argument("--metres-per-tile", type=float, default=1.0, metavar="M", help="size of a repeat (1)")
@@ -139,20 +139,21 @@ def _parser() -> argparse.ArgumentParser:
         help="a rectangle in px on an 18 %% grey card, in each photo or in one of the same light and exposure: tells "
         "how bright base colours are",
     )
-    diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)")
-    diffusion.add_argument("--model", default="", help="folder in diffusers' format, .safetensors checkpoint or hub id")
+    # what is not given is not in the result: DiffusionSettings has the defaults
+    diffusion = extract.add_argument_group("engine diffusion (docs/diffusion.md)", argument_default=argparse.SUPPRESS)
+    diffusion.add_argument("--model", help="folder in diffusers' format, .safetensors checkpoint or hub id")
     diffusion.add_argument("--online", action="store_true", help="fetch the model from the hub if it is not here")
-    diffusion.add_argument("--concepts", default="", metavar="DIR", help="keep learnt concepts here, to use them again")
-    diffusion.add_argument("--device", default="", help="cuda, mps or cpu (the best there is)")
-    diffusion.add_argument("--precision", default="", help="fp32, fp16 or bf16 (by device)")
-    diffusion.add_argument("--tuning-steps", type=int, default=800, metavar="N", help="at most (%(default)s)")
-    diffusion.add_argument("--prompt", default="", help="with S* for the region (one of the paper's)")
+    diffusion.add_argument("--concepts", metavar="DIR", help="keep learnt concepts here, to use them again")
+    diffusion.add_argument("--device", help="cuda, mps or cpu (the best there is)")
+    diffusion.add_argument("--precision", help="fp32, fp16 or bf16 (by device)")
+    diffusion.add_argument("--tuning-steps", type=int, metavar="N", help="at most (800)")
+    diffusion.add_argument("--prompt", help="with S* for the region (one of the paper's)")
     diffusion.add_argument("--steps", type=int, metavar="N", help="denoising steps (by quality: 25, 50, 50)")
-    diffusion.add_argument("--guidance", type=float, default=7.5, metavar="W", help="%(default)s; 1 for none")
-    diffusion.add_argument("--scheduler", default="", metavar="NAME", help="a scheduler of diffusers (the model's own)")
-    diffusion.add_argument("--prediction", default="", help="epsilon or v_prediction (the model's own)")
-    diffusion.add_argument("--roll", default="noise", help="noise, feature (few steps) or none (%(default)s)")
-    diffusion.add_argument("--roll-from", type=float, default=0.0, metavar="F", help="fraction of the steps (0)")
+    diffusion.add_argument("--guidance", type=float, metavar="W", help="1 for none (7.5)")
+    diffusion.add_argument("--scheduler", metavar="NAME", help="a scheduler of diffusers (the model's own)")
+    diffusion.add_argument("--prediction", help="epsilon or v_prediction (the model's own)")
+    diffusion.add_argument("--roll", help="noise, feature (few steps) or none (noise)")
+    diffusion.add_argument("--roll-from", type=float, metavar="F", help="fraction of the steps (0)")
     diffusion.add_argument("--candidates", type=int, metavar="K", help="samples; the best is kept (1; at best: 4)")
     resample = commands.add_parser("resample", help="other textures of materials extracted with --keep-concepts")
     resample.add_argument(
@@ -311,11 +312,12 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
         flatten=not arguments.no_flatten,
         white_balance=arguments.white_balance,
         metres_per_tile=arguments.metres_per_tile,
-        diffusion=_diffusion(arguments) if arguments.engine == "diffusion" else None,
+        diffusion=_diffusion(arguments),
         keep_concepts=arguments.keep_concepts,
         target_error=arguments.target_error,
     )
     settings.check()
+    _check_segmentation(arguments)
     card = parse_card(arguments.grey_card) if arguments.grey_card else None
     if card and settings.white_balance != "off":
         raise PaletteError("--grey-card and --white-balance both tell the light's colour; leave one out")
@@ -342,13 +344,13 @@ def _extract(photo_path: Path, masks: Path | None, folder: Path, arguments: argp
             else:
                 regions = read_regions(masks, shape, photo.scale)
         else:
-            from .segmentation import segment
+            from .segmentation import REGIONS, segment
 
             def warn(text: str) -> None:
                 photo.warnings.append(text)
                 line.say(f"warning: {text}")
 
-            chosen = arguments.segment, arguments.regions, settings.seed
+            chosen = arguments.segment, REGIONS if arguments.regions is None else arguments.regions, settings.seed
             regions = segment(photo.pixels, *chosen, line.progress, warn, arguments.weights)
         add_geometry(regions, corners, measures, photo.scale)
         if arguments.merge_alike is not None:
@@ -411,10 +413,27 @@ def _merged(photo, regions: list, most: float | bool, line) -> list:
 
 
 def _diffusion(arguments: argparse.Namespace):
+    """What was given of the engine's settings; PaletteError where another engine would leave it unread."""
     from .engines.diffusion import DiffusionSettings
 
-    given = {field.name: getattr(arguments, field.name, None) for field in fields(DiffusionSettings)}
-    return DiffusionSettings(**{name: value for name, value in given.items() if value is not None})
+    given = {
+        field.name: getattr(arguments, field.name) for field in fields(DiffusionSettings) if field.name in arguments
+    }
+    if arguments.engine == "diffusion":
+        return DiffusionSettings(**given)
+    if given:
+        names = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise PaletteError(f"engine '{arguments.engine}' has no {names}; add --engine diffusion or leave it out")
+    return None
+
+
+def _check_segmentation(arguments: argparse.Namespace) -> None:
+    """PaletteError for what only another way to regions would read."""
+    if arguments.masks is not None and arguments.regions is not None:
+        raise PaletteError("--regions tells how many regions are found; --masks names them. Leave one out")
+    if arguments.weights is not None and arguments.segment in (None, "auto"):
+        way = "--masks" if arguments.segment is None else "--segment auto"
+        raise PaletteError(f"{way} needs no --weights; add --segment sam or --segment materialistic, or leave it out")
 
 
 class _Line:
