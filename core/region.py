@@ -19,6 +19,7 @@ EXEMPLARS = "exemplars"  # folder of what each material was learnt from, beside 
 RESERVED = {"masks", EXEMPLARS, *PALETTE_FILES}  # beside the materials' folders
 GEOMETRY = "regions.json"  # beside the masks: corners and measures by region
 LONGEST_FILE_NAME = 100  # bytes; leaves room for suffixes and folders within what Windows takes
+LONGEST_NAME = 63  # bytes, of a data-block in Blender 4
 MASK_SUFFIXES = frozenset(
     ".png .jpg .jpeg .jpe .tif .tiff .bmp .tga .exr .hdr .webp .gif .pbm .pgm .ppm .pnm .pfm .psd .psb .jp2 .dpx .sgi "
     ".rgb .ico .avif .heic .heif .jxl".split()
@@ -175,9 +176,15 @@ def _metres(value: str | float, text: str, usage: str) -> float:
 
 
 def check_names(regions: list[Region]) -> None:
-    """Raise PaletteError for two regions whose files of maps would have one name on some system."""
+    """Raise PaletteError for two regions whose files of maps would have one name on some system, and for a name that
+    Blender 4 would cut, so that neither `fit` nor a scene's materials could be told by it."""
     owners = {}
     for region in regions:
+        if len(region.name.encode()) > LONGEST_NAME:
+            raise PaletteError(
+                f"The region's name '{region.name}' has {len(region.name.encode())} bytes; Blender's materials have at "
+                f"most {LONGEST_NAME}. Rename it, or its mask."
+            )
         owner = owners.setdefault(file_name(region.name).casefold(), region)
         if owner is not region:
             raise PaletteError(

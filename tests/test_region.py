@@ -9,6 +9,7 @@ from material_palette.core.region import (
     LEAST_RADIUS,
     Region,
     add_geometry,
+    check_names,
     check_region,
     file_name,
     read_regions,
@@ -90,6 +91,13 @@ def test_two_masks_of_one_name_are_refused(tmp_path, one, two):
     with pytest.raises(PaletteError, match="would name one material") as error:
         read_regions(tmp_path, SHAPE)
     assert one in str(error.value) and two in str(error.value)
+
+
+def test_a_name_that_blender_would_cut_is_refused():
+    whole = np.ones((64, 64), bool)
+    check_names([Region("é" * 31, whole)])
+    with pytest.raises(PaletteError, match="64 bytes"):
+        check_names([Region("é" * 32, whole)])
 
 
 def test_corners_off_the_photo_are_refused():
