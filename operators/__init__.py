@@ -61,7 +61,7 @@ def register():
 
 def unregister():
     background.stop()
-    for module in (background, history, examine, preview, pick):
+    for module in (background, history, examine, preview, pick, draw_region):
         module.forget()
     for name, function in _HANDLERS:
         getattr(bpy.app.handlers, name).remove(function)

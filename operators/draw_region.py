@@ -9,6 +9,7 @@ from ..core.errors import PaletteError
 from .regions import NeedsPhoto, add_region, image_editor, read_mask_image, set_mask, show_photo
 from .setup import NeedsPackages
 
+_handlers = set()  # of what is drawn by operators at work
 _NEAR = 10  # px; a click that near to a polygon's first corner closes it
 
 
@@ -27,6 +28,17 @@ def apply_outline(settings, points, take_away=False):
     if mask.shape != inside.shape:
         raise PaletteError(f"Region '{region.name}': its mask is not of the photo's size; paint it anew")
     set_mask(region, mask & ~inside if take_away else mask | inside)
+
+
+def forget():
+    """The extension is switched off while a tool is in use: nothing of it may be drawn any longer."""
+    for handler in list(_handlers):
+        _remove(handler)
+
+
+def _remove(handler):
+    _handlers.remove(handler)
+    bpy.types.SpaceImageEditor.draw_handler_remove(handler, "WINDOW")
 
 
 class OverPhoto(NeedsPackages, NeedsPhoto):
@@ -53,6 +65,7 @@ class OverPhoto(NeedsPackages, NeedsPhoto):
         self.region = next(region for region in self.area.regions if region.type == "WINDOW")
         self.photo = context.scene.material_palette.photo
         self.handler = bpy.types.SpaceImageEditor.draw_handler_add(self._draw, (), "WINDOW", "POST_PIXEL")
+        _handlers.add(self.handler)
         context.window_manager.modal_handler_add(self)
         context.window.cursor_modal_set("CROSSHAIR")
         context.workspace.status_text_set(self.hint)
@@ -83,9 +96,8 @@ class OverPhoto(NeedsPackages, NeedsPhoto):
         self.end(context, {"CANCELLED"})
 
     def end(self, context, result):
-        if self.handler is not None:
-            bpy.types.SpaceImageEditor.draw_handler_remove(self.handler, "WINDOW")
-            self.handler = None
+        if self.handler in _handlers:
+            _remove(self.handler)
             context.window.cursor_modal_restore()
             context.workspace.status_text_set(None)
             if self.area in list(context.window.screen.areas):

@@ -9,7 +9,7 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ..core.errors import PaletteError
-from .photo import read_pixels
+from .photo import photo_state, read_pixels
 from .regions import read_mask_image
 
 _THUMBNAIL = 48  # px of the photo to either side: few enough for the texture to be seen
@@ -28,7 +28,8 @@ class Examined:
 
 _known = {}  # session_uid of the mask image: Examined
 _stale = {}  # the same: time of the last change
-_photos = {}  # key of the one photo: (H, W, 3) uint8 sRGB-encoded
+_seen_in = {}  # the same: state of the photo it was looked at in
+_photos = {}  # state of the one photo: (H, W, 3) uint8 sRGB-encoded
 _icons = None
 
 
@@ -37,7 +38,7 @@ def known(region):
     if region.mask is None:
         return Examined(warning="It has no mask image: remove it, or import a mask")
     uid = region.mask.session_uid
-    if uid not in _known and uid not in _stale:
+    if uid not in _stale and (uid not in _known or _seen_in[uid] != _state(region.id_data.material_palette.photo)):
         changed(region.mask)
     return _known.get(uid)
 
@@ -64,7 +65,7 @@ def forget():
     global _icons
     if bpy.app.timers.is_registered(_look):
         bpy.app.timers.unregister(_look)
-    for memory in (_known, _stale, _photos):
+    for memory in (_known, _stale, _seen_in, _photos):
         memory.clear()
     if _icons is not None:
         bpy.utils.previews.remove(_icons)
@@ -114,10 +115,14 @@ def _square(at, half):
     return tuple(slice(max(0, i - half), i + half) for i in at)
 
 
+def _state(photo):
+    return photo_state(photo) if photo is not None else None
+
+
 def _photo(image):
     from ..core.image import srgb_from_linear
 
-    key = (image.session_uid, tuple(image.size)) if image is not None else None
+    key = _state(image)
     if key not in _photos:
         if image is None:
             raise PaletteError("Open a photo first")
@@ -144,10 +149,12 @@ def _look():
     for uid in [uid for uid in _stale if uid not in masks]:
         del _stale[uid]
         _known.pop(uid, None)
+        _seen_in.pop(uid, None)
     ready = [uid for uid, when in _stale.items() if now - when > _QUIET]
     if ready:
         uid = ready[0]
         del _stale[uid]
+        _seen_in[uid] = _state(masks[uid][0].photo)
         _known[uid], thumbnail = examine(*masks[uid])
         _known[uid].icon = _icon(uid, thumbnail)
         redraw_sidebars()

@@ -38,6 +38,13 @@ def photo_reader(image):
     return lambda: _reduced(pixels)
 
 
+def photo_state(image):
+    """What is another whenever the photo's pixels may be others: after Reload, painting, another colour space."""
+    path = bpy.path.abspath(image.filepath_raw, library=image.library)
+    written = os.stat(path).st_mtime_ns if os.path.isfile(path) else 0
+    return image.session_uid, tuple(image.size), path, written, image.is_dirty, image.colorspace_settings.name
+
+
 def take_photo(context, image):
     """Make `image` the scene's photo."""
     from .preferences import apply_defaults
@@ -122,7 +129,8 @@ def _orientation(path):
 
 
 def _open(path):
-    """Load `path` as an image, upright; raises PaletteError with the file's name when it is no picture."""
+    """Load `path` as an image, upright, and what was changed on the way; raises PaletteError with the file's name when
+    it is no picture."""
     if _is_turned(path):
         return _upright_copy(path)
     try:
@@ -133,7 +141,7 @@ def _open(path):
         if image.users == 0:
             bpy.data.images.remove(image)
         raise PaletteError(f"Not a picture, or a damaged one: {path}")
-    return image
+    return image, []
 
 
 def _upright_copy(path):
@@ -142,15 +150,16 @@ def _upright_copy(path):
     photo = read_photo(path)
     pixels = photo.pixels
     height, width = pixels.shape[:2]
-    image = bpy.data.images.new(os.path.basename(path), width, height, alpha=False)
+    bright = bool(pixels.max() > 1.001)  # floats: more than bytes hold
+    image = bpy.data.images.new(os.path.basename(path), width, height, alpha=False, float_buffer=bright)
     rgba = np.ones((height, width, 4), np.float32)
-    rgba[..., :3] = np.clip(srgb_from_linear(pixels[::-1]), 0.0, 1.0)
+    rgba[..., :3] = pixels[::-1] if bright else np.clip(srgb_from_linear(pixels[::-1]), 0.0, 1.0)
     image.pixels.foreach_set(rgba.ravel())
     image.pack()
     image[_SCALE] = photo.scale
     if photo.focal:
         image[_FOCAL] = photo.focal / max(height, width)
-    return image
+    return image, photo.warnings
 
 
 class MATERIAL_PALETTE_OT_open_photo(NeedsPackages, Operator):
@@ -176,10 +185,12 @@ class MATERIAL_PALETTE_OT_open_photo(NeedsPackages, Operator):
             self.report({"ERROR"}, f"No such file: {path}")
             return {"CANCELLED"}
         try:
-            image = _open(path)
+            image, warnings = _open(path)
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        for warning in warnings:
+            self.report({"WARNING"}, warning)
         take_photo(context, image)
         space = context.space_data
         if space is not None and space.type == "IMAGE_EDITOR":

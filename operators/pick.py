@@ -9,7 +9,7 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from .draw_region import OverPhoto, draw_line
-from .photo import photo_reader
+from .photo import photo_reader, photo_state
 from .preferences import pick_weights
 from .regions import add_region, set_mask
 
@@ -62,7 +62,7 @@ def select(photo, clicks, tolerance, weights="", box=None):
 
 
 def _key(photo, weights):
-    return photo.session_uid, tuple(photo.size), photo.filepath_raw, weights
+    return *photo_state(photo), weights
 
 
 class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
@@ -90,7 +90,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
         self.clicks, self.tolerance, self.key = [], 0.5, None
         self.box, self.corner, self.weights = None, None, pick_weights(context)
         self.pressed, self.at_press, self.shown = None, 0.5, 0.5
-        self.failure, self.thread = None, None
+        self.failure, self.thread, self.timer, self.waiting = None, None, None, False
         result = super().invoke(context, event)
         if "RUNNING_MODAL" in result:
             self._look(context)
@@ -115,6 +115,22 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
 
         self.thread = threading.Thread(target=work, name="material_palette_pick", daemon=True)
         self.thread.start()
+        self.timer = context.window_manager.event_timer_add(0.1, window=context.window)
+
+    def modal(self, context, event):
+        if event.type == "TIMER" and self.waiting and not self.thread.is_alive():
+            if self.failure is not None:
+                return self.end(context, self.handle(context, event))
+            self._apply(context)
+            if self.pressed is None:
+                bpy.ops.ed.undo_push(message="Pick Material")
+        return super().modal(context, event)
+
+    def end(self, context, result):
+        if self.timer is not None:
+            context.window_manager.event_timer_remove(self.timer)
+            self.timer = None
+        return super().end(context, result)
 
     def handle(self, context, event):
         if self.failure is not None:
@@ -144,8 +160,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
                 if min(self.box[2] - self.box[0], self.box[3] - self.box[1]) < 1:
                     self.box = None
                 else:
-                    self._apply(context)
-                    bpy.ops.ed.undo_push(message="Pick Material")
+                    self._finish(context)
         elif event.type == "MOUSEMOVE" and self.pressed is not None:
             change = (place[0] - self.pressed[0]) / _DRAG
             self.tolerance = min(max(self.at_press + change, 0.0), 1.0)
@@ -154,8 +169,7 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
             if self.pressed is not None:
                 self.pressed = None
-                self._apply(context)
-                bpy.ops.ed.undo_push(message="Pick Material")
+                self._finish(context)
         elif event.type in {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE"}:
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
@@ -169,12 +183,20 @@ class MATERIAL_PALETTE_OT_pick_region(OverPhoto, Operator):
         top, bottom = (min(max(at, 0), height) for at in sorted((y, v)))
         return left, top, right, bottom
 
+    def _finish(self, context):
+        self._apply(context)
+        if not self.waiting:
+            bpy.ops.ed.undo_push(message="Pick Material")
+
     def _apply(self, context):
-        settings = context.scene.material_palette
-        if self.thread is not None:
-            self.thread.join()
+        """Select what was clicked, or, while the photo is still being looked at, wait for the timer to do it."""
+        self.waiting = self.thread is not None and self.thread.is_alive()
+        if self.waiting:
+            context.workspace.status_text_set(f"Looking at the photo ...   {self.hint}")
+            return
         if self.failure is not None:
             return
+        settings = context.scene.material_palette
         self.shown = self.tolerance
         mask = select(self.photo, self.clicks, self.tolerance, self.weights, self.box)
         region = next((r for r in settings.regions if r.key == self.key), None)

@@ -81,6 +81,23 @@ def test_a_turned_photo_is_opened_upright(settings, tmp_path, orientation):
     assert photo_focal(settings.photo) == pytest.approx(read_focal(path)) and read_focal(path) > 0.5
 
 
+def test_a_turned_photo_in_floats_keeps_what_is_brighter_than_white(settings, tmp_path):
+    import OpenImageIO as oiio
+    from material_palette.operators.photo import photo_reader
+
+    pixels = np.full((40, 64, 3), 0.25, np.float32)
+    pixels[:20] = 3.0
+    spec = oiio.ImageSpec(64, 40, 3, "float")
+    spec.attribute("Orientation", 3)
+    path = str(tmp_path / "bright.tif")
+    output = oiio.ImageOutput.create(path)
+    output.open(path, spec)
+    output.write_image(pixels)
+    output.close()
+    bpy.ops.material_palette.open_photo(filepath=path)
+    np.testing.assert_allclose(photo_reader(settings.photo)()[0], pixels[::-1, ::-1], atol=1e-3)
+
+
 def test_a_packed_photo_is_no_larger_than_one_of_a_file(monkeypatch):
     from material_palette.core import image as core_image
     from material_palette.operators.photo import photo_reader

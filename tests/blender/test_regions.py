@@ -1,6 +1,9 @@
 """Edits of regions as the operators do them, and what the list says of a region."""
 
+import os
+
 import bpy
+import cv2
 import numpy as np
 import pytest
 from material_palette.core.errors import PaletteError
@@ -160,7 +163,7 @@ def test_a_failing_tool_of_the_mouse_leaves_nothing_behind(closed):
     """Even where its editor was closed by what failed: Blender's object of it can't be used then."""
     from types import SimpleNamespace
 
-    from material_palette.operators.draw_region import OverPhoto
+    from material_palette.operators.draw_region import OverPhoto, _handlers
 
     class Area:
         type = "IMAGE_EDITOR"
@@ -180,11 +183,12 @@ def test_a_failing_tool_of_the_mouse_leaves_nothing_behind(closed):
     tool.area = Area()
     areas = [tool.area]
     tool.handler = bpy.types.SpaceImageEditor.draw_handler_add(lambda: None, (), "WINDOW", "POST_PIXEL")
+    _handlers.add(tool.handler)
     window = SimpleNamespace(screen=SimpleNamespace(areas=areas), cursor_modal_restore=lambda: done.append("cursor"))
     context = SimpleNamespace(window=window, workspace=SimpleNamespace(status_text_set=lambda text: done.append(text)))
     with pytest.raises(KeyError, match="a bug"):
         tool.modal(context, SimpleNamespace(type="LEFTMOUSE", value="PRESS"))
-    assert tool.handler is None and done == ["cursor", None] + ["redraw"] * (not closed)
+    assert not _handlers and done == ["cursor", None] + ["redraw"] * (not closed)
 
 
 class Layout:
@@ -279,6 +283,30 @@ def test_pick_selects_the_clicked_half(settings, regions):
     assert not pick.select(image, [(40, 40, True), (40, 80, False)], 0.5)[80, 40]
     assert len(pick._features) == 1
     pick.forget()
+
+
+def test_a_photo_that_was_written_anew_is_looked_at_again(settings, tmp_path):
+    """Its name and size stay; the halves change places."""
+    from material_palette.operators import examine, pick
+
+    path = tmp_path / "halves.png"
+
+    def write(bright):
+        pixels = np.random.default_rng(0).normal(90, 4, (96, 160, 3))
+        pixels[:, bright, 0] += 100
+        cv2.imwrite(str(path), pixels.clip(0, 255).astype(np.uint8))
+
+    write(slice(0, 80))
+    image = bpy.data.images.load(str(path))
+    first = pick.select(image, [(20, 40, True)], 0.5), examine._photo(image).astype(int)
+    write(slice(40, 160))
+    os.utime(path, ns=(0, 10**18))
+    image.reload()
+    second = pick.select(image, [(20, 40, True)], 0.5), examine._photo(image).astype(int)
+    assert first[0][:, 50:70].mean() > 0.8 and second[0][:, 50:70].mean() < 0.1
+    assert abs(first[1] - second[1])[:, :30, 2].min() > 30
+    pick.forget()
+    examine.forget()
 
 
 def test_pick_by_weights_of_the_preferences_gets_clicks_and_box_in_px_of_what_it_saw(settings, monkeypatch):
