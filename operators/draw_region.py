@@ -6,7 +6,7 @@ from bpy.props import BoolProperty, EnumProperty
 from bpy.types import Operator
 
 from ..core.errors import PaletteError
-from .regions import NeedsPhoto, add_region, image_editor, read_mask_image, set_mask, show_photo
+from .regions import NeedsPhoto, add_region, image_editor, read_photo_mask, set_mask, show_photo
 from .setup import NeedsPackages
 
 _handlers = set()  # of what is drawn by operators at work
@@ -24,9 +24,7 @@ def apply_outline(settings, points, take_away=False):
         add_region(settings, "Region", inside)
         return
     region = settings.regions[settings.active_region]
-    mask = read_mask_image(region)
-    if mask.shape != inside.shape:
-        raise PaletteError(f"Region '{region.name}': its mask is not of the photo's size; paint it anew")
+    mask = read_photo_mask(region, settings.photo)
     set_mask(region, mask & ~inside if take_away else mask | inside)
 
 

@@ -5,7 +5,7 @@ from bpy.props import EnumProperty, FloatProperty
 from bpy.types import Operator
 
 from ..core.errors import PaletteError
-from .regions import NeedsRegion, add_region, read_mask_image, remove_region, set_mask
+from .regions import NeedsRegion, add_region, read_mask_image, read_photo_mask, remove_region, set_mask
 from .setup import NeedsPackages
 
 
@@ -158,10 +158,7 @@ class MATERIAL_PALETTE_OT_merge_alike(NeedsPackages, NeedsRegion, Operator):
         enabled = [region for region in settings.regions if region.enabled]
         try:
             pixels, _ = photo_reader(settings.photo)()
-            masks = {region.key: read_mask_image(region) for region in enabled}
-            for region in enabled:
-                if masks[region.key].shape[::-1] != tuple(settings.photo.size):
-                    raise PaletteError(f"Region '{region.name}': its mask isn't of the photo's size; paint it anew")
+            masks = {region.key: read_photo_mask(region, settings.photo) for region in enabled}
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

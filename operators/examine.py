@@ -10,7 +10,7 @@ from bpy.app.handlers import persistent
 
 from ..core.errors import PaletteError
 from .photo import photo_state, read_pixels
-from .regions import read_mask_image
+from .regions import read_photo_mask
 
 _THUMBNAIL = 48  # px of the photo to either side: few enough for the texture to be seen
 _QUIET = 0.4  # seconds without a change before a region is looked at again
@@ -80,12 +80,10 @@ def examine(settings, region):
     from ..core.region import Region, check_region
 
     try:
-        mask = read_mask_image(region)
         pixels = _photo(settings.photo)
+        mask = read_photo_mask(region, settings.photo)
     except PaletteError as error:
         return Examined(warning=str(error)), None
-    if mask.shape != pixels.shape[:2]:
-        return Examined(warning="Its mask is not of the photo's size: paint it anew"), None
     examined, thumbnail = Examined(area=float(mask.mean())), None
     if mask.any():
         at, distance = _middle(mask)

@@ -9,7 +9,7 @@ from .background import BackgroundOperator
 from .extract import light, nearest
 from .photo import photo_focal, photo_reader
 from .rectify import corners_of
-from .regions import image_editor, read_mask_image
+from .regions import image_editor, read_photo_mask
 
 NAME = "Exemplar"  # of the image; one is used again and again
 _OURS = "material_palette_exemplar"  # custom property that tells it from the user's own images
@@ -26,9 +26,7 @@ class MATERIAL_PALETTE_OT_preview_exemplar(BackgroundOperator, Operator):
         if settings.active_region >= len(settings.regions):
             raise PaletteError("No region to preview: add and paint one")
         region = settings.regions[settings.active_region]
-        if region.mask is not None and tuple(region.mask.size) != tuple(settings.photo.size):
-            raise PaletteError(f"Region '{region.name}': its mask isn't of the photo's size; paint it anew")
-        read, name, mask = photo_reader(settings.photo), region.name, read_mask_image(region)
+        read, name, mask = photo_reader(settings.photo), region.name, read_photo_mask(region, settings.photo)
         chosen = light(settings) | {"rectify": settings.rectify}
         corners, width = corners_of(region), settings.photo.size[0]
         focal = settings.focal_length / 36.0 or photo_focal(settings.photo)

@@ -19,7 +19,7 @@ from .palette import active_entry, drop_before, put_in_palette, region_of
 from .photo import photo_focal, photo_reader, photo_scale
 from .preferences import decomposer, diffusion_settings
 from .rectify import corners_of, measure_of
-from .regions import read_mask_image
+from .regions import read_photo_mask
 
 _EXTRACTION = 0.95  # share of the time; the rest is writing
 
@@ -322,15 +322,12 @@ def _read_masks(settings, regions):
 
     if not regions:
         raise PaletteError("No region to extract: add and paint one, import masks, or use Auto Segment")
-    size, owners, masks = tuple(settings.photo.size), {}, {}
+    owners, masks = {}, {}
     for region in regions:
         owner = owners.setdefault(file_name(region.name).casefold(), region)
         if owner != region:
             raise PaletteError(f"Regions '{owner.name}' and '{region.name}' would share one file name; rename one")
-        if region.mask is not None and tuple(region.mask.size) != size:
-            wrong, right = (f"{width} x {height} px" for width, height in (region.mask.size, size))
-            raise PaletteError(f"Region '{region.name}': its mask is {wrong}, the photo is {right}; paint it anew")
-        masks[region.name] = read_mask_image(region)
+        masks[region.name] = read_photo_mask(region, settings.photo)
     return masks
 
 

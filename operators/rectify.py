@@ -6,7 +6,7 @@ from bpy.types import Operator
 
 from ..core.errors import PaletteError
 from .draw_region import OverPhoto, draw_line
-from .regions import NeedsRegion, read_mask_image
+from .regions import NeedsRegion, read_photo_mask
 
 _REACH = 14  # px of the screen, from a handle
 
@@ -99,7 +99,8 @@ class MATERIAL_PALETTE_OT_corners(_OverRegion, Operator):
     def begin(self, region):
         corners = corners_of(region)
         if corners is None:
-            rows, columns = (np.flatnonzero(read_mask_image(region).any(axis)) for axis in (1, 0))
+            mask = read_photo_mask(region, bpy.context.scene.material_palette.photo)
+            rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
             if not len(rows):
                 raise PaletteError(f"Region '{region.name}' is empty; paint it first")
             top, bottom = np.percentile(rows, (20, 80))
@@ -182,7 +183,7 @@ class MATERIAL_PALETTE_OT_corners_from_camera(NeedsRegion, Operator):
             # Blender's cameras look along -Z with Y up
             axes = np.array(turn.normalized().transposed()) * (1.0, -1.0, -1.0)
             region = settings.regions[settings.active_region]
-            set_corners(region, corners_on_plane(axes[0], axes[1], focal, read_mask_image(region)))
+            set_corners(region, corners_on_plane(axes[0], axes[1], focal, read_photo_mask(region, settings.photo)))
         except PaletteError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -73,6 +73,14 @@ def read_mask_image(region):
     return (pixels.reshape(height, width, 4)[::-1, :, :3] > 0.0).any(-1)
 
 
+def read_photo_mask(region, photo):
+    """`read_mask_image` of a region of `photo`; raises PaletteError with both sizes where they differ, too."""
+    if region.mask is not None and tuple(region.mask.size) != tuple(photo.size):
+        wrong, right = ("{} x {} px".format(*image.size) for image in (region.mask, photo))
+        raise PaletteError(f"Region '{region.name}': its mask is {wrong}, the photo is {right}; paint it anew")
+    return read_mask_image(region)
+
+
 def follow_active_region(settings, context):
     """Where an Image Editor shows a region's mask, show the active region's instead."""
     if not (context.window_manager and settings.active_region < len(settings.regions)):

@@ -98,14 +98,14 @@ def test_the_list_says_what_is_wrong(settings, regions):
     settings.photo = bpy.data.images.new("grey", 160, 96)
     assert "constant" in examine(settings, regions[0])[0].warning
     settings.photo = bpy.data.images.new("larger", 200, 96)
-    assert "size" in examine(settings, regions[0])[0].warning
+    assert "paint it anew" in examine(settings, regions[0])[0].warning
 
 
 def test_a_mask_of_another_size_is_not_drawn_on(settings, regions):
     from material_palette.operators.draw_region import apply_outline
 
     settings.photo = bpy.data.images.new("larger", 200, 96)
-    with pytest.raises(PaletteError, match="size"):
+    with pytest.raises(PaletteError, match="paint it anew"):
         apply_outline(settings, [(0, 0), (50, 0), (50, 50)])
 
 

@@ -122,14 +122,12 @@ def test_search_finds_every_verb(extension):
 def test_choices_are_those_of_the_pipeline(extension):
     pytest.importorskip("torch")
     from material_palette import properties
-    from material_palette.core import command, engines, palette, segmentation
+    from material_palette.core import engines, palette, segmentation
 
     assert {identifier for identifier, *_ in properties.ENGINES} == set(engines.ENGINES)
     assert {identifier for identifier, *_ in properties.SEGMENTATIONS} == set(segmentation.SEGMENTERS)
     number = properties.MATERIAL_PALETTE_PG_settings.bl_rna.properties["auto_regions"]
     assert (number.default, number.hard_max) == (segmentation.REGIONS, segmentation.MOST_REGIONS)
-    typed = command._parser().parse_args(["extract", "photo.png", "--segment", "auto", "-o", "folder"])
-    assert typed.regions == segmentation.REGIONS
     assert tuple(identifier for identifier, *_ in properties.QUALITIES) == tuple(palette.QUALITIES)
     assert tuple(identifier for identifier, *_ in properties.WHITE_BALANCES) == palette.WHITE_BALANCES
     assert tuple(properties.RESOLUTION_RANGE) == tuple(palette.RESOLUTION_RANGE)
