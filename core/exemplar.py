@@ -32,6 +32,7 @@ LEAST_LEFT = 0.2  # of the patches; with fewer left the exemplar would no longer
 # patches that this may cost
 RIM, RIM_SHARE, RIM_COST = 2, 0.005, 0.2
 SPECK, HOLE = 5, 9  # px: side of the least square of white or black that is left out; smaller ones belong to a texture
+CROWDED = 0.5  # of what is within HOLE px or so: where more are specks, there is no texture to fill them from
 LINE = 40  # px: what is bright over such a length is a line, no specks
 LEAST_SAID = 0.01  # of the region
 # of `_sharpness`: 1 % of 89 photographed textures lie below it, and half of them after a blur of 2 px, all of 4 px
@@ -173,7 +174,8 @@ def without_white(pixels: np.ndarray, mask: np.ndarray, warnings: list[str]) -> 
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     cut, inside, said = pixels[box], mask[box], []
-    part = _without_area(inside, (cut >= white(cut, inside)).any(-1), SPECK, "over-exposed", said)[0]
+    area = _squares(inside & (cut >= white(cut, inside)).any(-1), SPECK)
+    part = _left(inside, area, "over-exposed", said)
     if part is inside:
         return mask
     warnings += said
@@ -186,36 +188,43 @@ def _without_colourless(pixels: np.ndarray, mask: np.ndarray, warnings: list[str
     """Pixels and mask without what the camera saw as white or as black; appends to warnings.
 
     An area is left out where one channel is at its end, for its hue is wrong. Specks of plain white or of GLARE, unless
-    they are lines, are filled from around them: left out they would take every patch that holds one with them; in
-    others with a channel at its end there is texture yet. A joint or a hole may be black; a black area is a failure.
+    they are lines or lie close together, are filled from around them: left out they would take every patch that holds
+    one with them; in others with a channel at its end there is texture yet. A joint or a hole may be black; a black
+    area is a failure.
     """
     ends, black = pixels >= white(pixels, mask), (pixels <= BLACK).all(-1)
     clipped = ends.any(-1)
-    mask, area = _without_area(mask, clipped, SPECK, "over-exposed", warnings)
+    area = _squares(mask & clipped, SPECK)
+    mask = _left(mask, area, "over-exposed", warnings)
     specks = mask & clipped & ~_widened(area)
     if specks.any():
         glare = (pixels > GLARE * masked_blur(pixels, mask & ~clipped, SPECK)).any(-1)
         specks &= glare | (pixels.min(-1) > PLAIN)
         specks &= ~_long(mask & glare)
-        share = specks.sum() / mask.sum()
+        lost = mask & _widened(specks)
+        crowded = mask & (masked_blur(lost.astype(np.float32), mask, HOLE / 2) > CROWDED)
+        mask = _left(mask, crowded, "lost in over-exposed specks", warnings)
+        share = (specks & mask).sum() / mask.sum()
         if share > LEAST_SAID:
             warnings.append(f"over-exposed specks, {share:.0%} of the region, are filled from around them")
-        pixels = _filled(pixels, mask, mask & _widened(specks))
-    return pixels, _without_area(mask, black, HOLE, "under-exposed", warnings)[0]
+        pixels = _filled(pixels, mask, lost & mask)
+    return pixels, _left(mask, _squares(mask & black, HOLE), "under-exposed", warnings)
 
 
-def _without_area(
-    mask: np.ndarray, lost: np.ndarray, side: int, what: str, warnings: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mask without what is lost in squares of `side` px at least, where enough is left, and these (h, w) bool."""
-    area = cv2.morphologyEx((mask & lost).astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+def _squares(lost: np.ndarray, side: int) -> np.ndarray:
+    """Of what is lost (h, w) bool the squares of `side` px."""
+    return cv2.morphologyEx(lost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+
+
+def _left(mask: np.ndarray, area: np.ndarray, what: str, warnings: list[str]) -> np.ndarray:
+    """The mask without an area (h, w) bool of it, where enough is left; appends to warnings."""
     share = area.sum() / mask.sum()
     left = _less(mask, _widened(area)) if share else mask
     if share and left is mask:
         warnings.append(f"{share:.0%} of the region is {what}; too little would be left without it: it is kept")
     elif share > LEAST_SAID:
         warnings.append(f"{share:.0%} of the region is {what} and left out")
-    return left, area
+    return left
 
 
 def _long(bright: np.ndarray) -> np.ndarray:

@@ -153,6 +153,18 @@ def test_specks_of_plain_white_and_of_glare_are_filled_and_a_bright_surface_kept
     assert cut_exemplar(photo, full(photo), flatten=False).pixels[:, 65:].max() < 0.5
 
 
+def test_where_specks_lie_close_together_nothing_is_made_up():
+    """Tiles of 4 px that the camera saw as white: filled from their joints the surface would be dark there."""
+    photo = linear_from_srgb(0.3 + 0.1 * pebbles(120, 120))
+    for row in range(0, 120, 6):
+        for column in range(0, 120, 6):
+            photo[row : row + 4, column : column + 4] = 1.0 if column < 48 else 0.6
+    exemplar = cut_exemplar(photo, full(photo), flatten=False)
+    assert not exemplar.mask[:, 8:40].any() and exemplar.mask[:, 60:].all()
+    assert exemplar.warnings == ["39% of the region is lost in over-exposed specks and left out"]
+    assert exemplar.pixels[:, 60:].max() == pytest.approx(0.6)
+
+
 def test_white_lines_are_paint_and_no_glare():
     photo = linear_from_srgb(0.2 + 0.3 * pebbles(160, 160))
     for x in range(160):
