@@ -38,7 +38,7 @@ def known(region):
     if region.mask is None:
         return Examined(warning="It has no mask image: remove it, or import a mask")
     uid = region.mask.session_uid
-    if uid not in _stale and (uid not in _known or _seen_in[uid] != _state(region.id_data.material_palette.photo)):
+    if uid not in _stale and (uid not in _known or _seen_in[uid] != photo_state(region.id_data.material_palette.photo)):
         changed(region.mask)
     return _known.get(uid)
 
@@ -113,14 +113,10 @@ def _square(at, half):
     return tuple(slice(max(0, i - half), i + half) for i in at)
 
 
-def _state(photo):
-    return photo_state(photo) if photo is not None else None
-
-
 def _photo(image):
     from ..core.image import srgb_from_linear
 
-    key = _state(image)
+    key = photo_state(image)
     if key not in _photos:
         if image is None:
             raise PaletteError("Open a photo first")
@@ -152,7 +148,7 @@ def _look():
     if ready:
         uid = ready[0]
         del _stale[uid]
-        _seen_in[uid] = _state(masks[uid][0].photo)
+        _seen_in[uid] = photo_state(masks[uid][0].photo)
         _known[uid], thumbnail = examine(*masks[uid])
         _known[uid].icon = _icon(uid, thumbnail)
         redraw_sidebars()

@@ -40,6 +40,8 @@ def photo_reader(image):
 
 def photo_state(image):
     """What is another whenever the photo's pixels may be others: after Reload, painting, another colour space."""
+    if image is None:
+        return None
     path = bpy.path.abspath(image.filepath_raw, library=image.library)
     written = os.stat(path).st_mtime_ns if os.path.isfile(path) else 0
     return image.session_uid, tuple(image.size), path, written, image.is_dirty, image.colorspace_settings.name

@@ -57,22 +57,28 @@ def test_open_photo_refuses_by_name(settings, tmp_path, data_blocks):
     assert data_blocks() == before
 
 
+def write_turned(path, pixels, orientation, **more):
+    """Write pixels (H, W, 3) uint8 or float32 with an EXIF orientation and other attributes; return the path."""
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, str(pixels.dtype).replace("float32", "float"))
+    for name, value in {"Orientation": orientation, **more}.items():
+        spec.attribute(name, value)
+    output = oiio.ImageOutput.create(str(path))
+    output.open(str(path), spec)
+    output.write_image(pixels)
+    output.close()
+    return str(path)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_turned_photo_is_opened_upright(settings, tmp_path, orientation):
-    import OpenImageIO as oiio
     from material_palette.core.image import read_focal, read_photo
     from material_palette.operators.photo import photo_focal, photo_reader, read_pixels
 
     pixels = np.zeros((40, 64, 3), np.uint8)
     pixels[:20, :32, 0] = 255
-    spec = oiio.ImageSpec(64, 40, 3, "uint8")
-    spec.attribute("Orientation", orientation)
-    spec.attribute("Exif:FocalLengthIn35mmFilm", 28)
-    path = str(tmp_path / "turned.tif")
-    output = oiio.ImageOutput.create(path)
-    output.open(path, spec)
-    output.write_image(pixels)
-    output.close()
+    path = write_turned(tmp_path / "turned.tif", pixels, orientation, **{"Exif:FocalLengthIn35mmFilm": 28})
 
     bpy.ops.material_palette.open_photo(filepath=path)
     upright = read_photo(path).pixels
@@ -82,18 +88,11 @@ def test_a_turned_photo_is_opened_upright(settings, tmp_path, orientation):
 
 
 def test_a_turned_photo_in_floats_keeps_what_is_brighter_than_white(settings, tmp_path):
-    import OpenImageIO as oiio
     from material_palette.operators.photo import photo_reader
 
     pixels = np.full((40, 64, 3), 0.25, np.float32)
     pixels[:20] = 3.0
-    spec = oiio.ImageSpec(64, 40, 3, "float")
-    spec.attribute("Orientation", 3)
-    path = str(tmp_path / "bright.tif")
-    output = oiio.ImageOutput.create(path)
-    output.open(path, spec)
-    output.write_image(pixels)
-    output.close()
+    path = write_turned(tmp_path / "bright.tif", pixels, 3)
     bpy.ops.material_palette.open_photo(filepath=path)
     np.testing.assert_allclose(photo_reader(settings.photo)()[0], pixels[::-1, ::-1], atol=1e-3)
 
